@@ -1,4 +1,4 @@
-"""Tasks of a scene that outlive a request: background tasks, and calls that a cancellation must not interrupt."""
+"""Tasks of a scene: background tasks, calls that a cancellation must not interrupt, and tasks that end together."""
 
 from __future__ import annotations
 
@@ -64,3 +64,21 @@ def shielded(function: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, Corou
         return await asyncio.shield(asyncio.ensure_future(function(*args, **kwargs)))
 
     return run
+
+
+async def run_until_first(
+    *coroutines: Coroutine[Any, Any, Any], seconds: float | None = None
+) -> tuple[asyncio.Task[Any], ...]:
+    """Runs coroutines until one of them ends or a time limit is over, and cancels the others.
+
+    Returns:
+        The tasks of the coroutines, in order, all of them ended.
+    """
+    tasks = tuple(asyncio.create_task(coroutine) for coroutine in coroutines)
+    try:
+        await asyncio.wait(tasks, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+    return tasks

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import difflib
 from collections.abc import AsyncIterator
 from typing import Annotated, Any
@@ -14,6 +12,7 @@ from fastapi.dependencies.utils import get_flat_params
 from fastapi.routing import APIRoute
 from starlette.requests import HTTPConnection
 
+from server.background import run_until_first
 from server.problems import Problem
 from server.processes.queries import Answer, Query
 from server.scene.exports import Exports
@@ -95,18 +94,11 @@ async def ask(request: Request, scene: Scene, query: Query) -> Answer:
     Raises:
         Problem: see `Readers.ask`; 503 if the client has closed the connection.
     """
-    asking = asyncio.ensure_future(scene.readers.ask(query))
-    leaving = asyncio.ensure_future(_hung_up(request))
-    try:
-        await asyncio.wait({asking, leaving}, return_when=asyncio.FIRST_COMPLETED)
-        if asking.done():
-            return asking.result()
-    finally:
-        for task in (asking, leaving):
-            task.cancel()
-            with contextlib.suppress(asyncio.CancelledError, Exception):
-                await task
-    raise Problem(503, "the client closed the connection", remedy="send the request again")
+    asking, leaving = await run_until_first(scene.readers.ask(query), _hung_up(request))
+    if asking.cancelled() and not leaving.cancelled():
+        raise Problem(503, "the client closed the connection", remedy="send the request again")
+    answer: Answer = asking.result()
+    return answer
 
 
 async def _hung_up(request: Request) -> None:
