@@ -135,15 +135,19 @@ class Retries:
         left = self._failed_at + self._outage - now
         if left <= 0:
             return None
-        # The exponent is limited because 2**n would overflow a float after a day of outage.
-        grown = FIRST_WAIT_S * 2.0 ** min(self._failures - 1, 16)
-        wait = max(min(grown, LONGEST_WAIT_S) * random.uniform(0.5, 1.0), asked)
+        wait = max(backoff(self._failures), asked)
         return self._notify(Retry("outage", min(wait, left), detail))
 
     def _notify(self, retry: Retry) -> float:
         if self._on_retry is not None:
             self._on_retry(retry)
         return retry.seconds
+
+
+def backoff(failures: int) -> float:
+    """Returns the delay in seconds after a number of consecutive failures, with a random factor."""
+    # The exponent is limited because 2**n would overflow a float after a day of outage.
+    return min(LONGEST_WAIT_S, FIRST_WAIT_S * 2.0 ** min(failures - 1, 16)) * random.uniform(0.5, 1.0)
 
 
 def retry_after_seconds(header: str) -> float | None:

@@ -11,7 +11,7 @@ import inspect
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Sequence
 from functools import wraps
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar, cast, overload
 
 import httpx
 
@@ -27,41 +27,39 @@ __all__ = ["DEFAULT_URL", "AsyncClient", "Client", "ServiceError"]
 
 P = ParamSpec("P")
 T = TypeVar("T")
-R = TypeVar("R")
+T_co = TypeVar("T_co", covariant=True)
 
 DEFAULT_URL = "http://127.0.0.1:8000"
 TIMEOUT_S = 130.0
 """Response timeout in seconds; the service itself abandons a query after 120 s."""
 
 
-def _with_signature(method: Callable[..., R], build: Callable[..., Any]) -> Callable[..., R]:
-    """Gives a method the signature of the function that builds its call, for `help` and editors."""
+class _Method(Protocol[P, T_co]):
+    """Method that sends a call: it returns the parsed response, or a coroutine of it in the async client."""
+
+    @overload
+    def __get__(self, client: Client, owner: Any = None) -> Callable[P, T_co]: ...
+    @overload
+    def __get__(self, client: AsyncClient, owner: Any = None) -> Callable[P, Coroutine[Any, Any, T_co]]: ...
+
+
+def _sends(build: Callable[P, Call[T]]) -> _Method[P, T]:
+    """Returns a method that sends the call that `build` returns, with the signature of `build` for `help`."""
+
+    @wraps(build)
+    def method(client: Any, /, *args: P.args, **kwargs: P.kwargs) -> Any:
+        return client.send(build(*args, **kwargs))
+
     signature = inspect.signature(build)
-    self = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
+    client = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
     method.__signature__ = signature.replace(  # type: ignore[attr-defined]
-        parameters=[self, *signature.parameters.values()], return_annotation=inspect.Signature.empty
+        parameters=[client, *signature.parameters.values()], return_annotation=inspect.Signature.empty
     )
-    return method
-
-
-def _sends(build: Callable[P, Call[T]]) -> Callable[Concatenate[Client, P], T]:
-    @wraps(build)
-    def method(self: Client, /, *args: P.args, **kwargs: P.kwargs) -> T:
-        return self.send(build(*args, **kwargs))
-
-    return _with_signature(method, build)
-
-
-def _sends_async(build: Callable[P, Call[T]]) -> Callable[Concatenate[AsyncClient, P], Coroutine[Any, Any, T]]:
-    @wraps(build)
-    async def method(self: AsyncClient, /, *args: P.args, **kwargs: P.kwargs) -> T:
-        return await self.send(build(*args, **kwargs))
-
-    return _with_signature(method, build)
+    return cast(_Method[P, T], method)
 
 
 class _ClientBase:
-    """Common base class of both clients, which stores the URL, token and timeouts."""
+    """Common base class of both clients, with the URL, token and timeouts, and one method per call."""
 
     def __init__(
         self, url: str, token: str | None, busy_timeout: float, outage: float, on_retry: OnRetry | None
@@ -88,6 +86,53 @@ class _ClientBase:
 
     def _retries(self, call: Call[Any]) -> Retries:
         return Retries(call, self.url, busy=self.busy_timeout, outage=self.outage, on_retry=self.on_retry)
+
+    live = _sends(calls.live)
+    ready = _sends(calls.ready)
+    ingest_ready = _sends(calls.ingest_ready)
+    cluster = _sends(calls.cluster)
+    metrics = _sends(calls.metrics)
+    ticket = _sends(calls.ticket)
+    share = _sends(calls.share)
+    create_scene = _sends(calls.create_scene)
+    estimate = _sends(calls.estimate)
+    scenes = _sends(calls.scenes)
+    scene = _sends(calls.scene)
+    rig = _sends(calls.rig)
+    pause = _sends(calls.pause)
+    resume = _sends(calls.resume)
+    begin_again = _sends(calls.begin_again)
+    edit_scene = _sends(calls.edit_scene)
+    put_to_sleep = _sends(calls.put_to_sleep)
+    delete_scene = _sends(calls.delete_scene)
+    put_points = _sends(calls.put_points)
+    put_frame = _sends(calls.put_frame)
+    put_camera = _sends(calls.put_camera)
+    close_frame = _sends(calls.close_frame)
+    declare_missing = _sends(calls.declare_missing)
+    frame = _sends(calls.frame)
+    frames = _sends(calls.frames)
+    ply = _sends(calls.ply)
+    states = _sends(calls.states)
+    begin_export = _sends(calls.begin_export)
+    exports = _sends(calls.exports)
+    export = _sends(calls.export)
+    export_file = _sends(calls.export_file)
+    delete_export = _sends(calls.delete_export)
+    picture = _sends(calls.picture)
+    render = _sends(calls.render)
+    render_file = _sends(calls.render_file)
+    render_arrays = _sends(calls.render_arrays)
+    tracks = _sends(calls.tracks)
+    tracks_arrays = _sends(calls.tracks_arrays)
+    parts = _sends(calls.parts)
+    joints = _sends(calls.joints)
+    gaussians = _sends(calls.gaussians)
+    budget = _sends(calls.budget)
+    set_budget = _sends(calls.set_budget)
+    tradeoff = _sends(calls.tradeoff)
+    replay = _sends(calls.replay)
+    end_replay = _sends(calls.end_replay)
 
 
 class Client(_ClientBase):
@@ -162,53 +207,6 @@ class Client(_ClientBase):
                 if wait is None:
                     return self._parse(call, response)
             time.sleep(wait)
-
-    live = _sends(calls.live)
-    ready = _sends(calls.ready)
-    ingest_ready = _sends(calls.ingest_ready)
-    cluster = _sends(calls.cluster)
-    metrics = _sends(calls.metrics)
-    ticket = _sends(calls.ticket)
-    share = _sends(calls.share)
-    create_scene = _sends(calls.create_scene)
-    estimate = _sends(calls.estimate)
-    scenes = _sends(calls.scenes)
-    scene = _sends(calls.scene)
-    rig = _sends(calls.rig)
-    pause = _sends(calls.pause)
-    resume = _sends(calls.resume)
-    begin_again = _sends(calls.begin_again)
-    edit_scene = _sends(calls.edit_scene)
-    put_to_sleep = _sends(calls.put_to_sleep)
-    delete_scene = _sends(calls.delete_scene)
-    put_points = _sends(calls.put_points)
-    put_frame = _sends(calls.put_frame)
-    put_camera = _sends(calls.put_camera)
-    close_frame = _sends(calls.close_frame)
-    declare_missing = _sends(calls.declare_missing)
-    frame = _sends(calls.frame)
-    frames = _sends(calls.frames)
-    ply = _sends(calls.ply)
-    states = _sends(calls.states)
-    begin_export = _sends(calls.begin_export)
-    exports = _sends(calls.exports)
-    export = _sends(calls.export)
-    export_file = _sends(calls.export_file)
-    delete_export = _sends(calls.delete_export)
-    picture = _sends(calls.picture)
-    render = _sends(calls.render)
-    render_file = _sends(calls.render_file)
-    render_arrays = _sends(calls.render_arrays)
-    tracks = _sends(calls.tracks)
-    tracks_arrays = _sends(calls.tracks_arrays)
-    parts = _sends(calls.parts)
-    joints = _sends(calls.joints)
-    gaussians = _sends(calls.gaussians)
-    budget = _sends(calls.budget)
-    set_budget = _sends(calls.set_budget)
-    tradeoff = _sends(calls.tradeoff)
-    replay = _sends(calls.replay)
-    end_replay = _sends(calls.end_replay)
 
     def put_frames(
         self, id: str, frames: Sequence[NewFrame], numbering: Numbering = "given", on_refusal: OnRefusal = "skip"
@@ -322,53 +320,6 @@ class AsyncClient(_ClientBase):
                 if wait is None:
                     return self._parse(call, response)
             await asyncio.sleep(wait)
-
-    live = _sends_async(calls.live)
-    ready = _sends_async(calls.ready)
-    ingest_ready = _sends_async(calls.ingest_ready)
-    cluster = _sends_async(calls.cluster)
-    metrics = _sends_async(calls.metrics)
-    ticket = _sends_async(calls.ticket)
-    share = _sends_async(calls.share)
-    create_scene = _sends_async(calls.create_scene)
-    estimate = _sends_async(calls.estimate)
-    scenes = _sends_async(calls.scenes)
-    scene = _sends_async(calls.scene)
-    rig = _sends_async(calls.rig)
-    pause = _sends_async(calls.pause)
-    resume = _sends_async(calls.resume)
-    begin_again = _sends_async(calls.begin_again)
-    edit_scene = _sends_async(calls.edit_scene)
-    put_to_sleep = _sends_async(calls.put_to_sleep)
-    delete_scene = _sends_async(calls.delete_scene)
-    put_points = _sends_async(calls.put_points)
-    put_frame = _sends_async(calls.put_frame)
-    put_camera = _sends_async(calls.put_camera)
-    close_frame = _sends_async(calls.close_frame)
-    declare_missing = _sends_async(calls.declare_missing)
-    frame = _sends_async(calls.frame)
-    frames = _sends_async(calls.frames)
-    ply = _sends_async(calls.ply)
-    states = _sends_async(calls.states)
-    begin_export = _sends_async(calls.begin_export)
-    exports = _sends_async(calls.exports)
-    export = _sends_async(calls.export)
-    export_file = _sends_async(calls.export_file)
-    delete_export = _sends_async(calls.delete_export)
-    picture = _sends_async(calls.picture)
-    render = _sends_async(calls.render)
-    render_file = _sends_async(calls.render_file)
-    render_arrays = _sends_async(calls.render_arrays)
-    tracks = _sends_async(calls.tracks)
-    tracks_arrays = _sends_async(calls.tracks_arrays)
-    parts = _sends_async(calls.parts)
-    joints = _sends_async(calls.joints)
-    gaussians = _sends_async(calls.gaussians)
-    budget = _sends_async(calls.budget)
-    set_budget = _sends_async(calls.set_budget)
-    tradeoff = _sends_async(calls.tradeoff)
-    replay = _sends_async(calls.replay)
-    end_replay = _sends_async(calls.end_replay)
 
     async def put_frames(
         self, id: str, frames: Sequence[NewFrame], numbering: Numbering = "given", on_refusal: OnRefusal = "skip"

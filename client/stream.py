@@ -16,6 +16,7 @@
 If the connection is lost, the client reconnects and renews all subscriptions, so that a stream survives a restart of
 the service. Trajectories are then sent again from their first frame. Iteration ends when the scene is deleted.
 """
+# ruff: noqa: F401
 
 from __future__ import annotations
 
@@ -30,8 +31,8 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import ClientConnection
 from websockets.sync.client import connect as connect_sync
 
+from client.retries import OUTAGE_S
 from client.subscriptions import (
-    OUTAGE_S,
     Event,
     PartsEvent,
     StatesEvent,
@@ -52,25 +53,6 @@ from client.wire.stream import (
     SceneGone,
     SceneMessage,
 )
-
-__all__ = [
-    "AsyncStream",
-    "Event",
-    "FrameMessage",
-    "PartsEvent",
-    "SceneMessage",
-    "StatesEvent",
-    "Stream",
-    "TracksEvent",
-    "ViewEvent",
-    "finished_frames",
-    "live_states",
-    "parts",
-    "scene_changes",
-    "tracks",
-    "view",
-]
-
 
 CONNECTION_ERRORS = (OSError, ConnectionClosed, InvalidHandshake, EOFError)
 

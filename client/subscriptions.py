@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import random
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,8 +16,10 @@ from websockets.exceptions import InvalidStatus
 from websockets.typing import Subprotocol
 
 from client.calls.call import wire_camera
+from client.calls.tracks import tracks_request
 from client.errors import error_of_problem, unreachable
-from client.wire import CameraModel, PartsModel, ProblemDetails, RenderRequest, TracksModel, TracksRequest
+from client.retries import backoff
+from client.wire import CameraModel, PartsModel, ProblemDetails, RenderRequest, TracksModel
 from client.wire.base import Model
 from client.wire.stream import (
     SERVER_MESSAGE,
@@ -38,9 +39,6 @@ from client.wire.stream import (
 )
 from scas4d_core.cameras import Camera
 
-OUTAGE_S = 20.0
-FIRST_WAIT_S = 0.2
-LONGEST_WAIT_S = 5.0
 UNREAD_MESSAGES = 2
 """Maximum number of messages to read ahead of the caller.
 
@@ -220,17 +218,8 @@ def tracks(
     >>> event.first, event.frame, event.model().ids
     (0, 2, [0, 1])
     """
-    request = {
-        "ids": None if ids is None else [int(id) for id in ids],
-        "pixels": None if pixels is None else np.asarray(pixels, dtype=np.float64).tolist(),
-        "camera": None if camera is None else wire_camera(camera),
-        "points": None if points is None else np.asarray(points, dtype=np.float64).tolist(),
-        "at": at,
-        "first": first,
-        "project": [wire_camera(one) for one in project],
-        "format": format,
-    }
-    return SubscriptionRequest(Topic.TRACKS, TracksRequest.model_validate(request))
+    request = tracks_request(ids, pixels, camera, points, at, (first, None), project, format)
+    return SubscriptionRequest(Topic.TRACKS, request)
 
 
 def parts(count: int | None = None, *, every: int = 1) -> SubscriptionRequest:
@@ -328,8 +317,7 @@ class StreamSession:
                 raise error_of_problem(_problem(error)) from error
             raise unreachable(self.address, error, self._failures) from error
         self._failures += 1
-        grown = min(LONGEST_WAIT_S, FIRST_WAIT_S * 2.0 ** min(self._failures - 1, 16))
-        return grown * random.uniform(0.5, 1.0)
+        return backoff(self._failures)
 
 
 def _problem(error: InvalidStatus) -> ProblemDetails:

@@ -30,24 +30,16 @@ from server.processes.placement import Placement
 from server.routes import (
     access,
     budget,
-    cluster,
-    estimate,
     exports,
     frames,
-    gaussians,
-    health,
     ingest,
-    inspect,
-    metrics,
     parts,
     points,
-    reconstructions,
     reference,
     render,
     scenes,
-    shares,
+    service,
     stream,
-    tickets,
     tracks,
     tradeoff,
     viewer,
@@ -124,25 +116,8 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
     if settings.trusted_proxies:
         app.add_middleware(ClientLimit, guard=app.state.guard)
     app.add_middleware(AccessLog)
-    resources = (
-        *(
-            scenes,
-            reconstructions,
-            inspect,
-            points,
-            frames,
-            ingest,
-            render,
-            tracks,
-            parts,
-            gaussians,
-            stream,
-            budget,
-            tradeoff,
-            exports,
-        ),
-        *(estimate, cluster, tickets, shares, health, metrics, viewer, reference),
-    )
+    of_scenes = (scenes, points, frames, ingest, render, tracks, parts, stream)
+    resources = (*of_scenes, budget, tradeoff, exports, service, viewer, reference)
     for resource in resources:
         app.include_router(
             resource.router, dependencies=[] if resource in (viewer, reference) else [Depends(access.only_known)]

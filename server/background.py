@@ -1,10 +1,14 @@
-"""A scene's background tasks, kept alive until they finish and cancelled when the scene is closed."""
+"""Tasks of a scene: background tasks, calls that a cancellation must not interrupt, and tasks that end together."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Coroutine
-from typing import Any
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 class Background:
@@ -47,3 +51,34 @@ class Background:
         """Cancels all tasks."""
         for task in tuple(self._tasks):
             task.cancel()
+
+
+def shielded(function: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, Coroutine[Any, Any, T]]:
+    """Decorator of a coroutine function, which then runs to completion even if its caller is cancelled.
+
+    A cancellation between journalling and updating the ledger would make them inconsistent.
+    """
+
+    @wraps(function)
+    async def run(*args: P.args, **kwargs: P.kwargs) -> T:
+        return await asyncio.shield(asyncio.ensure_future(function(*args, **kwargs)))
+
+    return run
+
+
+async def run_until_first(
+    *coroutines: Coroutine[Any, Any, Any], seconds: float | None = None
+) -> tuple[asyncio.Task[Any], ...]:
+    """Runs coroutines until one of them ends or a time limit is over, and cancels the others.
+
+    Returns:
+        The tasks of the coroutines, in order, all of them ended.
+    """
+    tasks = tuple(asyncio.create_task(coroutine) for coroutine in coroutines)
+    try:
+        await asyncio.wait(tasks, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+    return tasks

@@ -6,6 +6,8 @@ This module imports no other module of the service, so that every part of the se
 
 from __future__ import annotations
 
+from functools import partial
+
 from prometheus_client import CollectorRegistry, Counter, Histogram
 
 from scas4d_core.frame_outcome import AlarmKind
@@ -14,80 +16,64 @@ SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2, 4, 8, 16, 32, 64, 128
 
 registry = CollectorRegistry()
 """Registry of this process's metrics, without the metrics of the Python interpreter."""
+_counter = partial(Counter, registry=registry)
+_histogram = partial(Histogram, registry=registry, buckets=SECONDS)
 
-FRAMES = Counter(
+FRAMES = _counter(
     "scas4d_frames",
     "Frames that reached each state: acknowledged, committed, failed, skipped, missing.",
     ["state"],
-    registry=registry,
 )
-INGEST_BYTES = Counter(
-    "scas4d_ingest_bytes", "Bytes of encoded images and masks in acknowledged frames.", registry=registry
-)
-DEGRADED = Counter(
+INGEST_BYTES = _counter("scas4d_ingest_bytes", "Bytes of encoded images and masks in acknowledged frames.")
+DEGRADED = _counter(
     "scas4d_degraded_frames",
     "Committed frames that were rejected (keeping the previous state) or only partly fitted.",
     ["how"],
-    registry=registry,
 )
-DROPPED_CAMERAS = Counter(
+DROPPED_CAMERAS = _counter(
     "scas4d_cameras_left_out",
     "Cameras dropped from committed frames because of a missing, undecodable or outlying image.",
-    registry=registry,
 )
-ALARMS = Counter(
+ALARMS = _counter(
     "scas4d_alarms",
     "Alarms raised in committed frames, by kind.",
     ["kind"],
-    registry=registry,
 )
 for what in AlarmKind:
     ALARMS.labels(what.value)
-UPDATE_SECONDS = Histogram(
-    "scas4d_update_seconds", "Duration of each stage of an update.", ["stage"], buckets=SECONDS, registry=registry
-)
-FRAME_LATENCY = Histogram(
+UPDATE_SECONDS = _histogram("scas4d_update_seconds", "Duration of each stage of an update.", ["stage"])
+FRAME_LATENCY = _histogram(
     "scas4d_frame_latency_seconds",
     "Latency by stage: queue, update, commit, and their total; publish is from commit to sending to the first viewer.",
     ["stage"],
-    buckets=SECONDS,
-    registry=registry,
 )
-QUERY_SECONDS = Histogram(
+QUERY_SECONDS = _histogram(
     "scas4d_query_seconds",
     "Time until a scene's reader answers a query, by outcome and kind: render, tracks, parts, labels, gaussians, ply, "
     "compact.",
     ["kind", "outcome"],
-    buckets=SECONDS,
-    registry=registry,
 )
-STREAM_MISSED = Counter(
+STREAM_MISSED = _counter(
     "scas4d_stream_missed",
     "Messages that slow subscribers missed because newer messages replaced them.",
-    registry=registry,
 )
-RESTARTS = Counter(
+RESTARTS = _counter(
     "scas4d_process_restarts",
     "Scene processes that exited unexpectedly and were restarted.",
     ["process"],
-    registry=registry,
 )
-DAMAGE = Counter(
+DAMAGE = _counter(
     "scas4d_damage",
     "Damaged files found while the service was running: state, checkpoint, fixed, journal, frame, definition, points.",
     ["kind"],
-    registry=registry,
 )
-SCRUBBED = Counter(
-    "scas4d_scrubbed_bytes", "Bytes reread in the background and verified against checksums.", registry=registry
-)
+SCRUBBED = _counter("scas4d_scrubbed_bytes", "Bytes reread in the background and verified against checksums.")
 for kind in ("state", "checkpoint", "fixed", "journal", "frame", "definition", "points"):
     DAMAGE.labels(kind)
-CONNECTIONS_REFUSED = Counter(
+CONNECTIONS_REFUSED = _counter(
     "scas4d_connections_refused",
     "Connections and requests that were refused before they reached the application, by reason.",
     ["reason"],
-    registry=registry,
 )
 for state in ("acknowledged", "committed", "failed", "skipped", "missing"):
     FRAMES.labels(state)

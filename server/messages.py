@@ -99,14 +99,13 @@ class Ready:
     """Notification that the worker is ready to accept frames.
 
     `indices` lists the committed frames that it found, `damaged` maps the unreadable ones to the reason, and `report`
-    is the newest report. `undone` lists frames whose commit was rolled back and which must be sent again. `faults`
-    explains why, in one sentence per fault.
+    is the newest report. `faults` lists the reasons for commits that were rolled back, and the files that were
+    restored, in one sentence each.
     """
 
     indices: tuple[int, ...] = ()
     damaged: dict[int, str] = field(default_factory=dict)
     report: dict[str, Any] = field(default_factory=dict)
-    undone: tuple[int, ...] = ()
     faults: tuple[str, ...] = ()
 
 
@@ -261,13 +260,6 @@ class ReplayPoint:
     frames: int
 
 
-@dataclass(frozen=True)
-class ReplayEnded:
-    """Notification that the replay has ended; `fault` is None if all iteration counts were measured."""
-
-    fault: str | None = None
-
-
 # Messages to and from the export process; each export has its own process.
 
 
@@ -296,8 +288,11 @@ class ExportProgressed:
     size: int
 
 
+# The last message of both.
+
+
 @dataclass(frozen=True)
-class ExportEnded:
-    """Notification that the export has ended; `fault` is None if its file is complete."""
+class JobEnded:
+    """Notification that a replay or export has ended; `fault` is the reason why it failed, or None."""
 
     fault: str | None = None

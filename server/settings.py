@@ -45,169 +45,94 @@ class SettingsError(ValueError):
 class ServerSettings(BaseSettings):
     """Settings of the service, chosen by its operator."""
 
-    model_config = SettingsConfigDict(frozen=True, extra="forbid", hide_input_in_errors=True, env_prefix=PREFIX)
-
-    data: Path = Field(default=Path("data"), description="Data folder for the scenes; created if missing.")
-
-    host: str = Field(
-        default="127.0.0.1", description="Address to listen on. Any address other than loopback requires a token."
-    )
-    port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 selects any free port.")
-    token: SecretStr | None = Field(
-        default=None,
-        description=(
-            "Token that every request must send (Authorization: Bearer), except requests for /health, the "
-            "viewer's files and the API description. Without a token, every user of this machine has full access."
-        ),
-    )
-    token_file: Path | None = Field(
-        default=None, description="File that contains the token, such as a mounted secret; conflicts with `token`."
-    )
-    allowed_hosts: Names = Field(
-        default=(),
-        description=(
-            "Additional host names of the service: `studio.example`, or `studio.example:8443` for one port. "
-            "Requests for other names are refused, to prevent DNS rebinding."
-        ),
-    )
-    allowed_origins: Names = Field(
-        default=(),
-        description="Origins of other sites whose pages may use the service, such as `https://viewer.example`.",
+    model_config = SettingsConfigDict(
+        frozen=True, extra="forbid", use_attribute_docstrings=True, hide_input_in_errors=True, env_prefix=PREFIX
     )
 
-    header_seconds: float = Field(
-        default=10.0,
-        gt=0,
-        le=600,
-        description=(
-            "Time limit in seconds for sending a header, from the opening of the connection or the first byte "
-            "of a later request."
-        ),
-    )
-    header_kb: int = Field(
-        default=64,
-        ge=8,
-        le=1024,
-        description="Maximum size of a header including the URL, in units of 1024 bytes.",
-    )
-    body_seconds: float = Field(
-        default=20.0,
-        gt=0,
-        le=3600,
-        description="Time limit in seconds for every 16 kB of a request body, or for the remainder if it is shorter.",
-    )
-    keep_alive_seconds: float = Field(
-        default=15.0,
-        gt=0,
-        le=3600,
-        description=(
-            "Time in seconds after which an idle connection is closed. Clients and proxies should close theirs "
-            "earlier (httpx: 5 s)."
-        ),
-    )
-    unread_seconds: float = Field(
-        default=30.0,
-        gt=0,
-        le=3600,
-        description=(
-            "Time limit in seconds for a peer to read 16 kB of pending data; after that, its connection is aborted."
-        ),
-    )
-    max_connections: int = Field(
-        default=1024,
-        ge=8,
-        description="Maximum number of open connections, reduced to half of the limit on open files if that is lower.",
-    )
-    max_connections_per_peer: int = Field(
-        default=256,
-        ge=4,
-        description=(
-            "Maximum number of open connections per address, or per client of a trusted proxy. The default is enough "
-            "for 64 cameras with one sender each, plus viewers."
-        ),
-    )
-    trusted_proxies: Names = Field(
-        default=(),
-        description=(
-            "Addresses or networks (`10.0.0.2, 10.1.0.0/24`) of proxies whose X-Forwarded-For and "
-            "X-Forwarded-Proto are trusted."
-        ),
-    )
+    data: Path = Path("data")
+    """Data folder for the scenes; created if missing."""
 
-    log_format: Literal["auto", "json", "text"] = Field(
-        default="auto",
-        description=(
-            "Log format: json (one object per line), text (plain lines, without successful reads) or auto (text in a "
-            "terminal, otherwise json)."
-        ),
-    )
-    log_level: Literal["debug", "info", "warning", "error"] = Field(
-        default="info", description="Minimum log level; info logs one line per request."
-    )
+    host: str = "127.0.0.1"
+    """Address to listen on. Any address other than loopback requires a token."""
+    port: int = Field(default=8000, ge=0, le=65535)
+    """Port to listen on; 0 selects any free port."""
+    token: SecretStr | None = None
+    """Token that every request must send (Authorization: Bearer), except requests for /health, the viewer's files and
+    the API description. Without a token, every user of this machine has full access.
+    """
+    token_file: Path | None = None
+    """File that contains the token, such as a mounted secret; conflicts with `token`."""
+    allowed_hosts: Names = ()
+    """Additional host names of the service: `studio.example`, or `studio.example:8443` for one port. Requests for other
+    names are refused, to prevent DNS rebinding.
+    """
+    allowed_origins: Names = ()
+    """Origins of other sites whose pages may use the service, such as `https://viewer.example`."""
 
-    placement: str = Field(
-        default="local",
-        description=(
-            "Where the scenes' processes run: `local` (this machine), `ray` (the local Ray cluster, or the one in "
-            "RAY_ADDRESS) or `ray=HOST:6379` (the cluster at that address; see docs/cluster.md)."
-        ),
-    )
-    max_scenes: int = Field(
-        default=8,
-        ge=1,
-        description="Maximum number of awake scenes, each with up to three processes; others are asleep.",
-    )
-    sleep_seconds: float = Field(
-        default=600.0,
-        ge=0,
-        description="Time in seconds after which an unused scene falls asleep; 0 disables sleep.",
-    )
-    max_scene_memory_mb: float | None = Field(
-        default=None,
-        gt=0,
-        description="Maximum estimated memory of a scene, in MB; larger scenes are refused. Defaults to the "
-        "machine's memory.",
-    )
-    queue_frames: int = Field(
-        default=4,
-        ge=1,
-        description="Maximum number of acknowledged but unfinished frames per scene; further frames are refused (429). "
-        "At least 8 in scenes that skip frames.",
-    )
-    max_body_mb: float = Field(
-        default=256,
-        gt=0,
-        description=(
-            "Maximum size of a request body, in MB. The default allows 64 cameras with 4 MB each. Files and WebSocket "
-            "messages have smaller limits that depend on the rig."
-        ),
-    )
-    max_image_pixels: int = Field(
-        default=40_000_000,
-        ge=1,
-        description="Maximum number of pixels per camera. An image takes 3 bytes per pixel, and 6 during decoding.",
-    )
-    max_subscribers: int = Field(
-        default=128, ge=1, description="Maximum number of subscribers per scene; further ones are refused (429)."
-    )
-    scrub_mb_per_second: float = Field(
-        default=4.0,
-        ge=0,
-        description=(
-            "Rate at which each scene's files are reread to verify checksums, reduced to a quarter "
-            "during updates. 0 disables the check. Reading 4 MB/s takes half a percent of a core."
-        ),
-    )
-    scrub_pause_seconds: float = Field(
-        default=600.0, gt=0, description="Pause in seconds between scrub passes over a scene."
-    )
-    warm_up: bool = Field(
-        default=True,
-        description=(
-            "Whether to compile missing kernels at startup, in separate processes. /health/ready waits for the kernels "
-            "needed for a first frame."
-        ),
-    )
+    header_seconds: float = Field(default=10.0, gt=0, le=600)
+    """Time limit in seconds for sending a header, from the opening of the connection or the first byte of a later
+    request.
+    """
+    header_kb: int = Field(default=64, ge=8, le=1024)
+    """Maximum size of a header including the URL, in units of 1024 bytes."""
+    body_seconds: float = Field(default=20.0, gt=0, le=3600)
+    """Time limit in seconds for every 16 kB of a request body, or for the remainder if it is shorter."""
+    keep_alive_seconds: float = Field(default=15.0, gt=0, le=3600)
+    """Time in seconds after which an idle connection is closed. Clients and proxies should close theirs earlier (httpx:
+    5 s).
+    """
+    unread_seconds: float = Field(default=30.0, gt=0, le=3600)
+    """Time limit in seconds for a peer to read 16 kB of pending data; after that, its connection is aborted."""
+    max_connections: int = Field(default=1024, ge=8)
+    """Maximum number of open connections, reduced to half of the limit on open files if that is lower."""
+    max_connections_per_peer: int = Field(default=256, ge=4)
+    """Maximum number of open connections per address, or per client of a trusted proxy. The default is enough for 64
+    cameras with one sender each, plus viewers.
+    """
+    trusted_proxies: Names = ()
+    """Addresses or networks (`10.0.0.2, 10.1.0.0/24`) of proxies whose X-Forwarded-For and X-Forwarded-Proto are
+    trusted.
+    """
+
+    log_format: Literal["auto", "json", "text"] = "auto"
+    """Log format: json (one object per line), text (plain lines, without successful reads) or auto (text in a terminal,
+    otherwise json).
+    """
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    """Minimum log level; info logs one line per request."""
+
+    placement: str = "local"
+    """Where the scenes' processes run: `local` (this machine), `ray` (the local Ray cluster, or the one in RAY_ADDRESS)
+    or `ray=HOST:6379` (the cluster at that address; see docs/cluster.md).
+    """
+    max_scenes: int = Field(default=8, ge=1)
+    """Maximum number of awake scenes, each with up to three processes; others are asleep."""
+    sleep_seconds: float = Field(default=600.0, ge=0)
+    """Time in seconds after which an unused scene falls asleep; 0 disables sleep."""
+    max_scene_memory_mb: float | None = Field(default=None, gt=0)
+    """Maximum estimated memory of a scene, in MB; larger scenes are refused. Defaults to the machine's memory."""
+    queue_frames: int = Field(default=4, ge=1)
+    """Maximum number of acknowledged but unfinished frames per scene; further frames are refused (429). At least 8 in
+    scenes that skip frames.
+    """
+    max_body_mb: float = Field(default=256, gt=0)
+    """Maximum size of a request body, in MB. The default allows 64 cameras with 4 MB each. Files and WebSocket messages
+    have smaller limits that depend on the rig.
+    """
+    max_image_pixels: int = Field(default=40_000_000, ge=1)
+    """Maximum number of pixels per camera. An image takes 3 bytes per pixel, and 6 during decoding."""
+    max_subscribers: int = Field(default=128, ge=1)
+    """Maximum number of subscribers per scene; further ones are refused (429)."""
+    scrub_mb_per_second: float = Field(default=4.0, ge=0)
+    """Rate at which each scene's files are reread to verify checksums, reduced to a quarter during updates. 0 disables
+    the check. Reading 4 MB/s takes half a percent of a core.
+    """
+    scrub_pause_seconds: float = Field(default=600.0, gt=0)
+    """Pause in seconds between scrub passes over a scene."""
+    warm_up: bool = True
+    """Whether to compile missing kernels at startup, in separate processes. /health/ready waits for the kernels needed
+    for a first frame.
+    """
 
     @classmethod
     def settings_customise_sources(

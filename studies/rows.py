@@ -7,8 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from client.cli.evaluate import Report
-from client.cli.scores import Column, Row, digest, kept_row, markdown
+from client.cli.scores import Column, Row, digest, markdown, read_row, write_row
 from studies.machine import core_version, machine
+
+
+def kept_row(path: Path, measured: Callable[[], Row], *, again: bool = False) -> Row:
+    """Returns the stored row; measures and stores it first if it is missing or ``again`` is true."""
+    row = None if again else read_row(path)
+    if row is None:
+        row = measured()
+        write_row(path, row)
+    return row
 
 
 class RowStudy:

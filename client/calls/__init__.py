@@ -4,6 +4,7 @@ In the examples, `client` is a `client.sdk.Client`, and `scene` is the id of a s
 is its two-camera rig. `open_scene` is the id of a scene that still accepts frames, and `pictures` maps camera names to
 PNG files. `calls` is this package, `np` is NumPy, and `time` is the standard library module.
 """
+# ruff: noqa: F401
 
 from client.calls.budgets import budget, end_replay, replay, set_budget, tradeoff
 from client.calls.call import Call
@@ -21,7 +22,6 @@ from client.calls.frames import (
     put_frames,
     states,
 )
-from client.calls.gaussians import gaussians
 from client.calls.parts import joints, parts
 from client.calls.scenes import (
     begin_again,
@@ -38,57 +38,5 @@ from client.calls.scenes import (
     scenes,
 )
 from client.calls.service import cluster, ingest_ready, live, metrics, ready, share, ticket
-from client.calls.tracks import tracks, tracks_arrays
+from client.calls.tracks import gaussians, tracks, tracks_arrays
 from client.calls.views import render, render_arrays, render_file
-
-__all__ = [
-    "Call",
-    "NewFrame",
-    "begin_again",
-    "begin_export",
-    "budget",
-    "close_frame",
-    "cluster",
-    "create_scene",
-    "declare_missing",
-    "delete_export",
-    "delete_scene",
-    "edit_scene",
-    "end_replay",
-    "estimate",
-    "export",
-    "export_file",
-    "exports",
-    "frame",
-    "frames",
-    "gaussians",
-    "ingest_ready",
-    "joints",
-    "live",
-    "metrics",
-    "parts",
-    "pause",
-    "picture",
-    "ply",
-    "put_camera",
-    "put_frame",
-    "put_frames",
-    "put_points",
-    "put_to_sleep",
-    "ready",
-    "render",
-    "render_arrays",
-    "render_file",
-    "replay",
-    "resume",
-    "rig",
-    "scene",
-    "scenes",
-    "set_budget",
-    "share",
-    "states",
-    "ticket",
-    "tracks",
-    "tracks_arrays",
-    "tradeoff",
-]

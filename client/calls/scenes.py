@@ -18,10 +18,10 @@ from client.wire import (
     RigModel,
     SceneCreate,
     SceneEdit,
+    SceneEstimate,
     SceneList,
     SceneStatus,
 )
-from client.wire.estimate import SceneEstimate
 from scas4d_core.cameras import Rig
 from scas4d_core.captures import InitialPoints
 

@@ -1,4 +1,4 @@
-"""Calls for trajectories of Gaussians, pixels and 3D points."""
+"""Calls for trajectories of Gaussians, pixels and 3D points, and for the lifetimes of Gaussians."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from client.calls.call import Call, body, json_reader, path, read_npz, wire_camera
-from client.wire import TracksModel, TracksRequest
+from client.wire import GaussiansModel, TracksModel, TracksRequest
 from scas4d_core.cameras import Camera
 
 
@@ -43,7 +43,7 @@ def tracks(
     >>> client.tracks(scene, points=[[0, 0, 0]]).ids
     [0]
     """
-    request = _request(ids, pixels, camera, points, at, frames, project, "json")
+    request = tracks_request(ids, pixels, camera, points, at, frames, project, "json")
     return Call("POST", path(id, "tracks", "query"), json_reader(TracksModel), arguments=body(request))
 
 
@@ -63,20 +63,32 @@ def tracks_arrays(
     >>> client.tracks_arrays(scene, ids=[0, 1], project=["c0"])["tracks_world"].shape
     (3, 2, 3)
     """
-    request = _request(ids, pixels, camera, points, at, frames, project, "npz")
+    request = tracks_request(ids, pixels, camera, points, at, frames, project, "npz")
     return Call("POST", path(id, "tracks", "query"), read_npz, arguments=body(request))
 
 
-def _request(
+def gaussians(id: str, ids: Sequence[int]) -> Call[GaussiansModel]:
+    """Returns the lifetime of each requested Gaussian: the frames in which it was created, retired and revived.
+
+    >>> found = client.gaussians(scene, [1, 0])
+    >>> [(one.id, one.born, one.retired) for one in found.gaussians]
+    [(1, 0, []), (0, 0, [])]
+    """
+    arguments = {"params": {"ids": ",".join(str(int(value)) for value in ids)}}
+    return Call("GET", path(id, "gaussians"), json_reader(GaussiansModel), arguments=arguments)
+
+
+def tracks_request(
     ids: Sequence[int] | None,
     pixels: ArrayLike | None,
     camera: Camera | str | None,
     points: ArrayLike | None,
     at: int | None,
-    frames: tuple[int, int] | None,
+    frames: tuple[int | None, int | None] | None,
     project: Sequence[Camera | str],
     format: str,
 ) -> TracksRequest:
+    """Returns the request for trajectories; the arguments are those of `tracks`."""
     first, last = frames or (None, None)
     return TracksRequest.model_validate(
         {

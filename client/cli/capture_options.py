@@ -4,33 +4,16 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from enum import StrEnum
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 import typer
 
-from client.importers.open_source import CaptureOptions
+from client.importers.open_source import CaptureOptions, PicturesFrom
 from client.left_out import LeftOut
 from client.progress import console
-from scas4d_core.captures import Capture, CaptureError
-
-
-class PicturesFrom(StrEnum):
-    """Kinds of files from which a capture's images can be read."""
-
-    IMAGES = "images"
-    VIDEOS = "videos"
-    NAMED = "named"
-
-
-class SizeMismatch(StrEnum):
-    """How images whose aspect ratio differs from that of the calibration were produced."""
-
-    CORNER = "corner"
-    CENTRE = "centre"
-    STRETCH = "stretch"
+from scas4d_core.captures import Capture, CaptureError, SizeMismatch
 
 
 def _options(
@@ -63,11 +46,11 @@ def _options(
 ) -> CaptureOptions:
     return CaptureOptions(
         calibration=calibration,
-        pictures=None if pictures is None else pictures.value,
+        pictures=pictures,
         fps=capture_fps,
         use_masks=masks,
         test=tuple(test or ()),
-        size_mismatch=None if size_mismatch is None else size_mismatch.value,
+        size_mismatch=size_mismatch,
         bit_depth=bit_depth,
     )
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import typer
@@ -14,7 +13,9 @@ from client import rig
 from client.cli import scenes
 from client.cli.capture_options import finish, note, open_capture, with_capture_options
 from client.cli.changes import Changes, Labels, Preset, parse_changes, parse_labels
+from client.cli.scenes import Scene, Token, Url
 from client.importers.open_source import CaptureOptions
+from client.importers.source import Encoding
 from client.progress import Bars, console
 from client.sdk import DEFAULT_URL, Client
 from client.wire import FINISHED, FrameReportModel, IngestSettings
@@ -25,27 +26,7 @@ PUSH_OUTAGE_S = 600.0
 """How long a rig keeps retrying, in seconds; long enough to survive a restart of the service."""
 
 
-class Encoding(StrEnum):
-    """File format of re-encoded images."""
-
-    JPEG = "jpeg"
-    PNG = "png"
-
-
-class WhenFull(StrEnum):
-    """What the service does with a new frame when its queue is full."""
-
-    REFUSE = "refuse"
-    SKIP = "skip"
-
-
 CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Capture folder; see docs/captures.md.")]
-Url = Annotated[str, typer.Option(envvar="SCAS4D_URL", help="Service URL.")]
-Token = Annotated[
-    str | None,
-    typer.Option(envvar="SCAS4D_TOKEN", help="Access token; prefer the environment variable SCAS4D_TOKEN."),
-]
-Scene = Annotated[str, typer.Argument(metavar="SCENE", help="Scene id.")]
 Encode = Annotated[
     Encoding, typer.Option(help="Encoding of undistorted images and video frames; jpeg uses quality 95.")
 ]
@@ -87,13 +68,13 @@ def push(
         int, typer.Option(min=1, max=100, help="Send up to this many frames in one request; not with --per-camera.")
     ] = 1,
     when_full: Annotated[
-        WhenFull,
+        Literal["refuse", "skip"],
         typer.Option(help="refuse: wait while the queue is full; skip: replace the queued frames with the newest."),
-    ] = WhenFull.REFUSE,
+    ] = "refuse",
     outage: Annotated[
         float, typer.Option(min=0, help="Seconds to keep retrying while the service is unreachable.")
     ] = PUSH_OUTAGE_S,
-    encoding: Encode = Encoding.JPEG,
+    encoding: Encode = "jpeg",
     preset: Preset = "scas4d",
     changes: Changes = None,
     nodes: Labels = None,
@@ -102,7 +83,7 @@ def push(
     settings, labels = parse_changes(changes), parse_labels(nodes)
     if labels and scene is not None:
         raise ValueError("--node applies only to new scenes and cannot be combined with --scene; omit one of them")
-    source = open_capture(capture, options, encoding=encoding.value)
+    source = open_capture(capture, options, encoding=encoding)
     with Client(url, token=token, outage=0) as client:
         client.live()  # a wrong address fails immediately; only later outages are retried
     with Client(url, token=token, outage=outage) as client, Bars() as bars:
@@ -119,7 +100,7 @@ def push(
             batch=batch,
             preset=preset,
             settings=settings,
-            ingest=IngestSettings(when_full=when_full.value),
+            ingest=IngestSettings(when_full=when_full),
             nodes=labels,
             on_progress=bars,
             on_message=note,
@@ -285,12 +266,12 @@ def import_(
     options: CaptureOptions,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="New folder for the undistorted capture.")],
     frames: Annotated[int | None, typer.Option(min=1, help="Maximum number of frames to import.")] = None,
-    encoding: Encode = Encoding.JPEG,
+    encoding: Encode = "jpeg",
 ) -> None:
     """Writes an undistorted copy of a capture, which can be read at the rig's frame rate without OpenCV and PyAV."""
     from client.importers.write import write_dynamic3dgs
 
-    source = open_capture(capture, options, encoding=encoding.value)
+    source = open_capture(capture, options, encoding=encoding)
     with Bars() as bars:
         left_out = write_dynamic3dgs(source, out, frames=frames, on_progress=bars, on_message=note)
     count = len(source.rig) + (0 if source.test_rig is None else len(source.test_rig))

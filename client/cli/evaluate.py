@@ -212,7 +212,7 @@ def measure(
     if not unseen:
         report("    no test cameras: scoring the training cameras instead (use --test to hold some out)")
     # Imported lazily: this loads the kernels, which printing an existing table does not need.
-    from scas4d_core.metrics.evaluation import measure_flicker, measure_parts, measure_pictures, measure_tracks
+    from scas4d_core.metrics.evaluation import measure_pictures
 
     store.start_frames(job.key)
     count = given.frame_count if job.frames is None else min(job.frames, given.frame_count)
@@ -279,18 +279,35 @@ def measure(
         "psnr_first": lines[0]["psnr"],
         **summary(lines),
     }
-    if truth.ground_truth is not None and count > 1:
-        row |= measure_tracks(reconstruction, truth, indices)
-        row |= measure_parts(reconstruction, truth, indices)
-    if count > 1:
-        row |= measure_flicker(reconstruction, truth, indices)
-    row["peak_mb"] = peak_megabytes()
     folder = store.folder / "pictures" / job.key
-    for index in sorted({range(count)[i] for i in job.pictures if -count <= i < count}):
-        save_comparisons(reconstruction, truth, index, folder)
+    row |= score_sequence(reconstruction, truth, indices, job.pictures, folder)
     if "parts_count" in row:
         save_parts(reconstruction, truth, indices[-1], reconstruction.parts(int(row["parts_count"])), folder)
     return reconstruction, row
+
+
+def score_sequence(scene: Committed, truth: Capture, indices: Sequence[int], shown: Sequence[int], folder: Path) -> Row:
+    """Scores the tracks, parts and flicker of a sequence, and saves comparison images of some frames.
+
+    Args:
+        scene: committed states.
+        truth: capture with the test cameras.
+        indices: frames of the sequence.
+        shown: positions in `indices` of the frames to save; negative ones count from the end.
+        folder: folder for the images.
+    """
+    from scas4d_core.metrics.evaluation import measure_flicker, measure_parts, measure_tracks
+
+    row: Row = {}
+    if len(indices) > 1:
+        if truth.ground_truth is not None:
+            row |= measure_tracks(scene, truth, indices)
+            row |= measure_parts(scene, truth, indices)
+        row |= measure_flicker(scene, truth, indices)
+    row["peak_mb"] = peak_megabytes()
+    for index in sorted({indices[i] for i in shown if -len(indices) <= i < len(indices)}):
+        save_comparisons(scene, truth, index, folder)
+    return row
 
 
 def summary(lines: Sequence[Row]) -> Row:

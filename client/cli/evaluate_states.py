@@ -13,15 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.console import Console
 
-from client.cli.evaluate import (
-    DEFAULT_OPTIONS,
-    TRAINING,
-    Report,
-    peak_megabytes,
-    save_comparisons,
-    score_tables,
-    summary,
-)
+from client.cli.evaluate import DEFAULT_OPTIONS, TRAINING, Report, score_sequence, score_tables, summary
 from client.cli.scores import Row, Store
 from client.exports.sources import Source, of_path
 from client.importers.open_source import CaptureOptions
@@ -109,7 +101,7 @@ def scale_of(changes: Mapping[str, Any]) -> float:
 def _measure(found: Source, truth: Capture, store: Store, frames: int | None, report: Report) -> Row:
     # Imported lazily: these load the kernels, which the command line alone does not need.
     from scas4d_core.engines.limits import rig_limits
-    from scas4d_core.metrics.evaluation import measure_flicker, measure_parts, measure_pictures, measure_tracks
+    from scas4d_core.metrics.evaluation import measure_pictures
     from scas4d_core.query.committed import CommittedScene
     from scas4d_core.storage.history import History
 
@@ -148,15 +140,7 @@ def _measure(found: Source, truth: Capture, store: Store, frames: int | None, re
         **summary(lines),
     }
     row.pop("alarms", None)  # stored states have no alarms
-    if len(chosen) > 1:
-        if truth.ground_truth is not None:
-            row |= measure_tracks(scene, truth, chosen)
-            row |= measure_parts(scene, truth, chosen)
-        row |= measure_flicker(scene, truth, chosen)
-    row["peak_mb"] = peak_megabytes()
-    for index in sorted({chosen[i] for i in SHOWN if -len(chosen) <= i < len(chosen)}):
-        save_comparisons(scene, truth, index, store.folder / "pictures" / key)
-    return row
+    return row | score_sequence(scene, truth, chosen, SHOWN, store.folder / "pictures" / key)
 
 
 def _with_ids(state: Gaussians, history: History) -> Gaussians:

@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from client import __version__
-from client.cli import commands, extras, viewing
+from client.cli import commands, extras, scenes, viewing
 from client.cli.capture_options import open_capture, with_capture_options
 from client.cli.changes import Changes, Preset, parse_changes
 from client.errors import ServiceError, ServiceUnreachable
@@ -197,8 +197,8 @@ def export(
         float | None,
         typer.Option("--source-fps", help="Frame rate of numbered files, which have no timestamps. [30]"),
     ] = None,
-    url: commands.Url = DEFAULT_URL,
-    token: commands.Token = None,
+    url: scenes.Url = DEFAULT_URL,
+    token: scenes.Token = None,
 ) -> None:
     """Exports reconstructed frames to other formats (splats, glTF, USD, tables) or to an offline player page.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated
 
 import typer
@@ -16,6 +16,7 @@ Token = Annotated[
     str | None,
     typer.Option(envvar="SCAS4D_TOKEN", help="Access token; prefer the environment variable SCAS4D_TOKEN."),
 ]
+Scene = Annotated[str, typer.Argument(metavar="SCENE", help="Scene id.")]
 Scenes = Annotated[list[str], typer.Argument(metavar="SCENE...", help="Scene ids.")]
 
 app = typer.Typer(help="Lists and manages the service's scenes.", invoke_without_command=True)
@@ -60,7 +61,7 @@ def listed(
 
 @app.command()
 def rename(
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Scene id.")],
+    scene: Scene,
     name: Annotated[str, typer.Argument(metavar="NAME", help="New name; the id does not change.")],
     url: Url = DEFAULT_URL,
     token: Token = None,
@@ -73,38 +74,30 @@ def rename(
 @app.command()
 def pause(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
     """Pauses scenes after the current frame: they still accept frames, but do not reconstruct them."""
-    with Client(url, token=token) as client:
-        for scene in scenes:
-            _told(client.pause(scene))
+    _change(scenes, url, token, lambda client, scene: client.pause(scene))
 
 
 @app.command()
 def resume(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
     """Resumes paused scenes."""
-    with Client(url, token=token) as client:
-        for scene in scenes:
-            _told(client.resume(scene))
+    _change(scenes, url, token, lambda client, scene: client.resume(scene))
 
 
 @app.command()
 def archive(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
     """Archives scenes: they accept no frames, sleep unless someone views them, and are listed only with --all."""
-    with Client(url, token=token) as client:
-        for scene in scenes:
-            _told(client.edit_scene(scene, archived=True))
+    _change(scenes, url, token, lambda client, scene: client.edit_scene(scene, archived=True))
 
 
 @app.command()
 def restore(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
     """Restores archived scenes."""
-    with Client(url, token=token) as client:
-        for scene in scenes:
-            _told(client.edit_scene(scene, archived=False))
+    _change(scenes, url, token, lambda client, scene: client.edit_scene(scene, archived=False))
 
 
 @app.command()
 def keep(
-    scene: Annotated[str, typer.Argument(metavar="SCENE", help="Scene id.")],
+    scene: Scene,
     frames: Annotated[
         str | None,
         typer.Option(metavar="COUNT|all", help="Number of newest frames whose images to keep, or all."),
@@ -144,9 +137,7 @@ def keep(
 @app.command()
 def sleep(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
     """Stops the processes of idle scenes now; a scene wakes up on the next request or frame."""
-    with Client(url, token=token) as client:
-        for scene in scenes:
-            _told(client.put_to_sleep(scene))
+    _change(scenes, url, token, lambda client, scene: client.put_to_sleep(scene))
 
 
 @app.command()
@@ -186,6 +177,12 @@ def _rule(option: str, given: str | None) -> Retention | None:
     if not given.isdecimal():
         raise ValueError(f"{option} must be a number of frames or all, such as {option} 100; got {given!r}")
     return Retention(last=int(given))
+
+
+def _change(scenes: Sequence[str], url: str, token: str | None, call: Callable[[Client, str], SceneStatus]) -> None:
+    with Client(url, token=token) as client:
+        for scene in scenes:
+            _told(call(client, scene))
 
 
 def _told(status: SceneStatus) -> None:

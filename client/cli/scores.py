@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,15 +19,6 @@ def read_row(path: Path) -> Row | None:
     if not path.exists():
         return None
     row: Row = json.loads(path.read_text())
-    return row
-
-
-def kept_row(path: Path, measured: Callable[[], Row], *, again: bool = False) -> Row:
-    """Returns the stored row; measures and stores it first if it is missing or ``again`` is true."""
-    row = None if again else read_row(path)
-    if row is None:
-        row = measured()
-        write_row(path, row)
     return row
 
 

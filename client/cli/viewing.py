@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from client.cli import commands
+from client.cli import scenes
 from client.cli.capture_options import print_remarks, with_capture_options
 from client.importers.open_source import CaptureOptions
 from client.sdk import DEFAULT_URL
@@ -71,8 +71,8 @@ def video(
     background: Annotated[
         str | None, typer.Option(help="Background colour, such as white or #202020; default: the scene's.")
     ] = None,
-    url: commands.Url = DEFAULT_URL,
-    token: commands.Token = None,
+    url: scenes.Url = DEFAULT_URL,
+    token: scenes.Token = None,
 ) -> None:
     """Renders frames to a video from a camera that orbits, stays fixed or follows key poses.
 
@@ -110,8 +110,8 @@ def rerun(
     tracks: Annotated[int, typer.Option(min=0, max=10_000, help="Number of moving points to draw trails for.")] = 30,
     trail: Annotated[float, typer.Option(min=0, help="Trail length in seconds of scene time.")] = 0.5,
     parts: Annotated[bool, typer.Option("--parts", help="Colour points by part.")] = False,
-    url: commands.Url = DEFAULT_URL,
-    token: commands.Token = None,
+    url: scenes.Url = DEFAULT_URL,
+    token: scenes.Token = None,
 ) -> None:
     """Writes frames as a recording for the Rerun viewer (extra `rerun`): points, tracks, the rig and parts.
 

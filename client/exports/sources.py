@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,50 +18,15 @@ from scas4d_core.compact import CompactReader, FileHeader
 from scas4d_core.errors import InputError
 from scas4d_core.gaussians import Gaussians
 
+if TYPE_CHECKING:
+    from scas4d_core.exports.reading import ExportedStates
+
 STATES = "states.s4d"
 """Name of the compact file that `scas4d reconstruct` writes to its output folder."""
 MOST = 120
 """Maximum number of frames per request to the service."""
 LAST = 1_000_000_000
 """Largest possible frame index."""
-
-
-class States(Protocol):
-    """States of a sequence, read one at a time.
-
-    Attributes:
-        head: world frame, rig, frame rate and background.
-        frames: frame indices in ascending order.
-        times: frame times in seconds.
-        damage: reason why only part of the source can be read; None if all of it can be read.
-        remarks: sentences that describe data missing from the source.
-    """
-
-    @property
-    def head(self) -> FileHeader:
-        """World frame, rig, frame rate and background."""
-
-    @property
-    def frames(self) -> Sequence[int]:
-        """Frame indices in ascending order."""
-
-    @property
-    def times(self) -> Sequence[float]:
-        """Times of all frames in seconds."""
-
-    @property
-    def damage(self) -> str | None:
-        """Reason why only part of the source can be read, or None."""
-
-    @property
-    def remarks(self) -> Sequence[str]:
-        """Sentences that describe data missing from the source."""
-
-    def parts(self) -> NDArray[np.int64] | None:
-        """Returns the part label of each Gaussian [N], or None if there are no labels."""
-
-    def states(self, low: int = 0, high: int = LAST) -> Iterator[tuple[int, float, Gaussians]]:
-        """Yields the index, time in seconds and state of each frame from ``low`` to ``high``."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +41,7 @@ class Source:
 
     name: str
     beside: Path
-    of: States
+    of: CompactStates | ExportedStates
 
     @property
     def head(self) -> FileHeader:

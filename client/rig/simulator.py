@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
 from client.errors import ServiceError, ServiceUnreachable
@@ -113,7 +113,7 @@ def push(
                 ingest=ingest,
                 nodes=nodes,
             )
-            stack.push(_DeleteIfEmpty(client, status.id, on_message))
+            stack.enter_context(_delete_if_empty(client, status.id, on_message))
             if source.points is not None and start == 0:
                 client.put_points(status.id, source.points)
         else:
@@ -152,59 +152,49 @@ def push(
     return delivery
 
 
-class _record_retries:
+@contextmanager
+def _record_retries(client: Client, lateness: Lateness, on_message: OnMessage) -> Iterator[None]:
     """Context manager that records the client's waiting times and reports the start of an outage."""
+    before, lock, is_out = client.on_retry, threading.Lock(), False
 
-    def __init__(self, client: Client, lateness: Lateness, on_message: OnMessage) -> None:
-        self._client = client
-        self._lateness = lateness
-        self._on_message = on_message
-        self._before = client.on_retry
-        self._out = False
-        self._lock = threading.Lock()
-
-    def __enter__(self) -> None:
-        self._client.on_retry = self._on_retry
-
-    def __exit__(self, *_: object) -> None:
-        self._client.on_retry = self._before
-
-    def _on_retry(self, retry: Retry) -> None:
-        with self._lock:  # the threads of several cameras may wait at the same time
+    def on_retry(retry: Retry) -> None:
+        nonlocal is_out
+        with lock:  # the threads of several cameras may wait at the same time
             if retry.reason == "busy":
-                self._lateness.busy += retry.seconds
-                self._lateness.busy_count += 1
+                lateness.busy += retry.seconds
+                lateness.busy_count += 1
             else:
-                self._lateness.outage += retry.seconds
-                self._lateness.outage_count += 1
-                if not self._out:
-                    self._on_message(f"the service is unavailable ({retry.detail}); retrying")
-            self._out = retry.reason == "outage"
-        if self._before is not None:
-            self._before(retry)
+                lateness.outage += retry.seconds
+                lateness.outage_count += 1
+                if not is_out:
+                    on_message(f"the service is unavailable ({retry.detail}); retrying")
+            is_out = retry.reason == "outage"
+        if before is not None:
+            before(retry)
+
+    client.on_retry = on_retry
+    try:
+        yield
+    finally:
+        client.on_retry = before
 
 
-class _DeleteIfEmpty:
+@contextmanager
+def _delete_if_empty(client: Client, scene: str, on_message: OnMessage) -> Iterator[None]:
     """Context manager that deletes a new scene after an error if no frame of it has been accepted."""
-
-    def __init__(self, client: Client, scene: str, on_message: OnMessage) -> None:
-        self._client = client
-        self._scene = scene
-        self._on_message = on_message
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None:
-            return
-        if not issubclass(kind, ServiceUnreachable):  # which has been retried long enough
+    try:
+        yield
+    except BaseException as error:
+        checked = False
+        if not isinstance(error, ServiceUnreachable):  # which has been retried long enough
             with suppress(ServiceError, ServiceUnreachable):
-                status = self._client.scene(self._scene)
+                status = client.scene(scene)
                 if status.next_frame == status.missing:
-                    self._client.delete_scene(self._scene)
-                return
-        self._on_message(f"scene {self._scene} may be empty; if so: scas4d scenes delete {self._scene}")
+                    client.delete_scene(scene)
+                checked = True
+        if not checked:
+            on_message(f"scene {scene} may be empty; if so: scas4d scenes delete {scene}")
+        raise
 
 
 def _check_cameras(status: SceneStatus, source: Capture) -> None:

@@ -74,4 +74,4 @@ Pixel = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
 class Model(BaseModel):
     """Base class of the wire models. Unknown fields are errors, so that misspelled names are detected."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True)

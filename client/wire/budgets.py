@@ -18,52 +18,24 @@ Iterations = Annotated[int, Field(strict=True, ge=1, le=MOST_ITERATIONS)]
 class Budget(Model):
     """Limits for a scene's updates. Null fields default to the scene's settings."""
 
-    iterations: Iterations | None = Field(
-        default=None, description="Iterations per frame; see the setting `update.iterations`."
-    )
-    budget_ms: float | None = Field(
-        default=None,
-        strict=True,
-        gt=0,
-        le=LONGEST_MS,
-        allow_inf_nan=False,
-        description=(
-            "Milliseconds per frame, until the new state is in memory. The update runs as many iterations "
-            "as fit, regardless of `iterations`."
-        ),
-    )
-    keep_up_fps: float | None = Field(
-        default=None,
-        strict=True,
-        ge=LOWEST_FPS,
-        le=1000,
-        allow_inf_nan=False,
-        description=(
-            "Frames per second to keep up with. It replaces `budget_ms`: each frame gets the time that this rate "
-            "leaves, and less while frames are waiting."
-        ),
-    )
-    stop_gain: float | None = Field(
-        default=None,
-        strict=True,
-        ge=0,
-        lt=1,
-        description=(
-            "End an update once ten iterations lower its error on four training views by less than "
-            "this fraction; 0 to never end it early."
-        ),
-    )
-    skip_tolerance: float | None = Field(
-        default=None,
-        strict=True,
-        ge=-1,
-        le=1000,
-        allow_inf_nan=False,
-        description=(
-            "Skip the update if the previous state's error on the probe views is at most (1 + this value) × "
-            "the usual error; -1 to never skip."
-        ),
-    )
+    iterations: Iterations | None = None
+    """Iterations per frame; see the setting `update.iterations`."""
+    budget_ms: float | None = Field(default=None, strict=True, gt=0, le=LONGEST_MS, allow_inf_nan=False)
+    """Milliseconds per frame, until the new state is in memory. The update runs as many iterations as fit, regardless
+    of `iterations`.
+    """
+    keep_up_fps: float | None = Field(default=None, strict=True, ge=LOWEST_FPS, le=1000, allow_inf_nan=False)
+    """Frames per second to keep up with. It replaces `budget_ms`: each frame gets the time that this rate leaves, and
+    less while frames are waiting.
+    """
+    stop_gain: float | None = Field(default=None, strict=True, ge=0, lt=1)
+    """End an update once ten iterations lower its error on four training views by less than this fraction; 0 to never
+    end it early.
+    """
+    skip_tolerance: float | None = Field(default=None, strict=True, ge=-1, le=1000, allow_inf_nan=False)
+    """Skip the update if the previous state's error on the probe views is at most (1 + this value) × the usual error;
+    -1 to never skip.
+    """
 
 
 class BudgetFields(TypedDict, total=False):
@@ -80,8 +52,10 @@ class EffectiveBudget(Model):
     """The limits in effect, with defaults filled in."""
 
     iterations: int
-    budget_ms: float | None = Field(description="Milliseconds per frame while no frame is waiting; null for no limit.")
-    keep_up_fps: float | None = Field(default=None, description="Frames per second to keep up with; null for none.")
+    budget_ms: float | None
+    """Milliseconds per frame while no frame is waiting; null for no limit."""
+    keep_up_fps: float | None = None
+    """Frames per second to keep up with; null for none."""
     stop_gain: float
     skip_tolerance: float
 
@@ -90,6 +64,9 @@ class SceneBudget(Model):
     """The requested and the effective budget of a scene."""
 
     scene: str
-    requested: Budget = Field(description="The most recently requested budget; fields that were not set are null.")
-    effective: EffectiveBudget = Field(description="The budget for frames whose update has not started.")
-    since: int = Field(description="The first frame to which the effective budget applies.")
+    requested: Budget
+    """The most recently requested budget; fields that were not set are null."""
+    effective: EffectiveBudget
+    """The budget for frames whose update has not started."""
+    since: int
+    """The first frame to which the effective budget applies."""

@@ -47,16 +47,16 @@ class ExportState(StrEnum):
 class ExportRequest(Model):
     """A request to export a range of committed frames (see docs/exports.md)."""
 
-    format: ExportFormat = Field(description="File format; docs/exports.md lists what each format preserves and loses.")
-    first: FrameNumber | None = Field(default=None, description="First frame; null for the first committed frame.")
-    last: FrameNumber | None = Field(
-        default=None, description="Last frame, inclusive; null for the last committed frame."
-    )
+    format: ExportFormat
+    """File format; docs/exports.md lists what each format preserves and loses."""
+    first: FrameNumber | None = None
+    """First frame; null for the first committed frame."""
+    last: FrameNumber | None = None
+    """Last frame, inclusive; null for the last committed frame."""
     ids: (
         Annotated[list[Annotated[int, Field(ge=0, le=LARGEST_ID)]], Field(min_length=1, max_length=MOST_IDS)] | None
-    ) = Field(
-        default=None, description="Ids of the Gaussians to export as `tracks` or `tapvid-mv`; null for moving ones."
-    )
+    ) = None
+    """Ids of the Gaussians to export as `tracks` or `tapvid-mv`; null for moving ones."""
 
 
 class ExportModel(Model):
@@ -65,19 +65,27 @@ class ExportModel(Model):
     id: str
     scene: str
     format: ExportFormat
-    first: int = Field(description="First exported frame.")
-    last: int = Field(description="Last exported frame.")
+    first: int
+    """First exported frame."""
+    last: int
+    """Last exported frame."""
     state: ExportState
-    done: int = Field(description="Number of frames written so far.")
-    frames: int = Field(description="Number of frames in total.")
-    bytes: int = Field(description="Number of bytes on disk so far; the size of the file once the export is done.")
-    error: str | None = Field(description="Reason why the export failed or was cancelled.")
-    created: str = Field(description="Creation time, ISO 8601.")
-    expires: str | None = Field(description="Time at which the file will be removed; null until the export is done.")
-    name: str = Field(description="File name. Numbered files are packed into a single .zip.")
-    file: str | None = Field(
-        description="Path of the file, relative to the service address; null until the export is done."
-    )
+    done: int
+    """Number of frames written so far."""
+    frames: int
+    """Number of frames in total."""
+    bytes: int
+    """Number of bytes on disk so far; the size of the file once the export is done."""
+    error: str | None
+    """Reason why the export failed or was cancelled."""
+    created: str
+    """Creation time, ISO 8601."""
+    expires: str | None
+    """Time at which the file will be removed; null until the export is done."""
+    name: str
+    """File name. Numbered files are packed into a single .zip."""
+    file: str | None
+    """Path of the file, relative to the service address; null until the export is done."""
 
 
 class ExportList(Model):

@@ -63,41 +63,36 @@ class FrameFile(Model):
 
     camera: CameraName
     kind: FileKind = FileKind.IMAGE
-    size: int = Field(ge=0, description="Size in bytes.")
+    size: int = Field(ge=0)
+    """Size in bytes."""
 
 
 class FrameHead(Model):
     """The header of a framed body: the frame's index, time and files."""
 
     index: int = Field(ge=0, le=MAX_INDEX)
-    time: FrameSeconds | None = Field(
-        default=None, description="Timestamp in seconds; default: the index divided by the scene's frame rate."
-    )
+    time: FrameSeconds | None = None
+    """Timestamp in seconds; default: the index divided by the scene's frame rate."""
     files: Annotated[list[FrameFile], Field(min_length=1, max_length=2 * MAX_CAMERAS)]
-    single_camera: bool = Field(
-        default=False,
-        description=(
-            "Whether the files belong to one camera, as in PUT …/frames/{n}/cameras/{c}, instead of a whole frame."
-        ),
-    )
+    single_camera: bool = False
+    """Whether the files belong to one camera, as in PUT …/frames/{n}/cameras/{c}, instead of a whole frame."""
 
 
 class IngestAnswer(Model):
     """The response to one frame of a batch, or to one binary message of `WS …/ingest`."""
 
-    index: int | None = Field(description="Index of the frame; null if its header could not be read.")
-    status: int = Field(description="Status code, as for a frame that is sent alone: 202, 409, 413, 422, 429, 507 …")
-    retry_after: int | None = Field(default=None, description="Seconds to wait; the same as Retry-After over HTTP.")
-    receipt: FrameReceipt | CameraReceipt | None = Field(
-        default=None, description="Receipt, which confirms that the files are on disk; only with status 202."
-    )
-    problem: ProblemDetails | None = Field(default=None, description="Problem document; only with other statuses.")
-    missing: bool = Field(
-        default=False,
-        description=(
-            "Whether the refused frame was declared missing, so that later frames of its batch could be accepted."
-        ),
-    )
+    index: int | None
+    """Index of the frame; null if its header could not be read."""
+    status: int
+    """Status code, as for a frame that is sent alone: 202, 409, 413, 422, 429, 507 …"""
+    retry_after: int | None = None
+    """Seconds to wait; the same as Retry-After over HTTP."""
+    receipt: FrameReceipt | CameraReceipt | None = None
+    """Receipt, which confirms that the files are on disk; only with status 202."""
+    problem: ProblemDetails | None = None
+    """Problem document; only with other statuses."""
+    missing: bool = False
+    """Whether the refused frame was declared missing, so that later frames of its batch could be accepted."""
 
 
 class FrameBatch(Model):
@@ -166,26 +161,3 @@ def parse_head(data: bytes | bytearray | memoryview) -> FrameHead:
         raise FramingError(
             f"has an invalid header{' field ' + field if field else ''}: {first['msg']}", "correct the header"
         ) from None
-
-
-def parse_frame(data: bytes | bytearray | memoryview) -> tuple[FrameHead, list[memoryview]]:
-    """Returns the header and zero-copy views of each file's bytes.
-
-    Raises:
-        FramingError: the data is not a frame, is truncated, or is longer than the header states.
-    """
-    view = memoryview(data)
-    at = PREFIX.size + head_length(view[: PREFIX.size])
-    if at > len(view):
-        raise FramingError(f"is truncated within its header, after {len(view)} bytes", "send the whole frame")
-    head = parse_head(view[PREFIX.size : at])
-    expected = at + sum(file.size for file in head.files)
-    if len(view) != expected:
-        raise FramingError(
-            f"has {len(view)} bytes, but its header declares {expected}", "send exactly the files that the header lists"
-        )
-    pieces = []
-    for file in head.files:
-        pieces.append(view[at : at + file.size])
-        at += file.size
-    return head, pieces

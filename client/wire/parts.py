@@ -7,7 +7,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from client.wire.base import Model, Row3
 
@@ -18,46 +17,48 @@ GOLDEN = 0.618033988749895
 class PartsModel(Model):
     """Part labels of all Gaussians. Parts keep their labels and colours across frames."""
 
-    count: int = Field(description="Number of parts.")
-    frame: int = Field(description="Newest frame that was used to find the parts.")
-    ids: list[int] = Field(description="[N] ids of the Gaussians.")
-    labels: list[int] = Field(
-        description=(
-            "[N] labels, starting at 0; −1 for static Gaussians. If `count` was requested, some labels may be unused."
-        )
-    )
-    colours: list[tuple[int, int, int]] = Field(
-        description="RGB colour (0…255) of each label from 0 to the largest. A label always has the same colour."
-    )
+    count: int
+    """Number of parts."""
+    frame: int
+    """Newest frame that was used to find the parts."""
+    ids: list[int]
+    """[N] ids of the Gaussians."""
+    labels: list[int]
+    """[N] labels, starting at 0; −1 for static Gaussians. If `count` was requested, some labels may be unused."""
+    colours: list[tuple[int, int, int]]
+    """RGB colour (0…255) of each label from 0 to the largest. A label always has the same colour."""
 
 
 class JointModel(Model):
     """A joint between two parts, in the rig's world frame and units. Null while one of the parts is absent."""
 
-    parent: int = Field(description="Label of the parent part; −1 if the child is attached to something static.")
-    child: int = Field(description="Label of the child part.")
-    kind: Literal["revolute", "prismatic", "spherical"] = Field(description="Hinge, slider or ball joint.")
-    axes: list[Row3 | None] = Field(
-        description="[T] unit vectors of the axis. The axis of a ball joint is that of the child's present rotation."
-    )
-    centres: list[Row3 | None] = Field(
-        description="[T] points on the axis where the parts meet, or centres of the ball."
-    )
-    values: list[float | None] = Field(
-        description=(
-            "[T] angles in radians by which the child has rotated about the axis, relative to the parent, since the "
-            "first frame with both; for sliders, distances along the axis."
-        )
-    )
-    error: float = Field(description="RMS distance between the child's points and their positions by the joint.")
+    parent: int
+    """Label of the parent part; −1 if the child is attached to something static."""
+    child: int
+    """Label of the child part."""
+    kind: Literal["revolute", "prismatic", "spherical"]
+    """Hinge, slider or ball joint."""
+    axes: list[Row3 | None]
+    """[T] unit vectors of the axis. The axis of a ball joint is that of the child's present rotation."""
+    centres: list[Row3 | None]
+    """[T] points on the axis where the parts meet, or centres of the ball."""
+    values: list[float | None]
+    """[T] angles in radians by which the child has rotated about the axis, relative to the parent, since the first
+    frame with both; for sliders, distances along the axis.
+    """
+    error: float
+    """RMS distance between the child's points and their positions by the joint."""
 
 
 class JointsModel(Model):
     """Joints between the parts of a scene over T frames."""
 
-    frames: list[int] = Field(description="[T] frame indices.")
-    times: list[float] = Field(description="[T] frame times in seconds.")
-    joints: list[JointModel] = Field(description="Joints, parents before their children.")
+    frames: list[int]
+    """[T] frame indices."""
+    times: list[float]
+    """[T] frame times in seconds."""
+    joints: list[JointModel]
+    """Joints, parents before their children."""
 
 
 def part_colour(label: int) -> tuple[int, int, int]:

@@ -16,14 +16,14 @@ class CameraModel(Model):
     """A pinhole camera without distortion, with OpenCV axes and pixel centres at +0.5."""
 
     name: CameraName
-    intrinsics: Annotated[list[Row3], Field(min_length=3, max_length=3)] = Field(
-        description="[[fx,0,cx],[0,fy,cy],[0,0,1]] in pixels; (0, 0) is the upper left corner of the image."
-    )
-    world_to_camera: Annotated[list[Row4], Field(min_length=4, max_length=4)] = Field(
-        description="Pose matrix [[R, t], [0, 1]] with X_cam = R X_world + t, in the user's units."
-    )
-    width: int = Field(ge=1, le=MAX_PIXELS_A_SIDE, description="Width of the images in pixels.")
-    height: int = Field(ge=1, le=MAX_PIXELS_A_SIDE, description="Height of the images in pixels.")
+    intrinsics: Annotated[list[Row3], Field(min_length=3, max_length=3)]
+    """[[fx,0,cx],[0,fy,cy],[0,0,1]] in pixels; (0, 0) is the upper left corner of the image."""
+    world_to_camera: Annotated[list[Row4], Field(min_length=4, max_length=4)]
+    """Pose matrix [[R, t], [0, 1]] with X_cam = R X_world + t, in the user's units."""
+    width: int = Field(ge=1, le=MAX_PIXELS_A_SIDE)
+    """Width of the images in pixels."""
+    height: int = Field(ge=1, le=MAX_PIXELS_A_SIDE)
+    """Height of the images in pixels."""
 
     @model_validator(mode="after")
     def _check_camera(self) -> CameraModel:
@@ -54,11 +54,8 @@ class CameraModel(Model):
 class RigModel(Model):
     """The cameras of a scene."""
 
-    axes: Literal["opencv"] = Field(
-        description=(
-            "Camera axes: x right, y down, z forward. The only supported convention, which must be stated explicitly."
-        )
-    )
+    axes: Literal["opencv"]
+    """Camera axes: x right, y down, z forward. The only supported convention, which must be stated explicitly."""
     cameras: Annotated[list[CameraModel], Field(min_length=1, max_length=MAX_CAMERAS)]
 
     @model_validator(mode="after")

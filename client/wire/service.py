@@ -15,23 +15,22 @@ class Health(Model):
     status: Literal["live", "ready"]
     version: str
     scenes: int
-    process: int | None = Field(default=None, description="Process id of the service on its machine; only in /live.")
-    ready_after: float | None = Field(
-        default=None, description="Seconds from the start of the service until its kernels were compiled."
-    )
-    ingest_ready: bool | None = Field(
-        default=None, description="Whether the disk has space for frames; null if not checked."
-    )
+    process: int | None = None
+    """Process id of the service on its machine; only in /live."""
+    ready_after: float | None = None
+    """Seconds from the start of the service until its kernels were compiled."""
+    ingest_ready: bool | None = None
+    """Whether the disk has space for frames; null if not checked."""
 
 
 class Ticket(Model):
     """A single-use ticket that opens one WebSocket from a browser, which cannot send a bearer token."""
 
     ticket: str
-    subprotocol: str = Field(
-        description="Value to offer in Sec-WebSocket-Protocol, in addition to the stream's protocol."
-    )
-    seconds: float = Field(description="Lifetime of the ticket in seconds.")
+    subprotocol: str
+    """Value to offer in Sec-WebSocket-Protocol, in addition to the stream's protocol."""
+    seconds: float
+    """Lifetime of the ticket in seconds."""
 
 
 class ProblemDetails(BaseModel):
@@ -51,23 +50,22 @@ class ProblemDetails(BaseModel):
 class ShareRequest(Model):
     """A request for a read-only token."""
 
-    scene: str | None = Field(
-        default=None, max_length=64, description="The only scene that the token can read; null for all scenes."
-    )
-    seconds: int = Field(
-        default=7 * 86_400, ge=1, le=316_224_000, description="Lifetime of the token in seconds; by default a week."
-    )
+    scene: str | None = Field(default=None, max_length=64)
+    """The only scene that the token can read; null for all scenes."""
+    seconds: int = Field(default=7 * 86_400, ge=1, le=316_224_000)
+    """Lifetime of the token in seconds; by default a week."""
 
 
 class Share(Model):
     """A read-only token, and a viewer URL that contains it."""
 
-    token: str = Field(description="Token for `Authorization: Bearer`.")
+    token: str
+    """Token for `Authorization: Bearer`."""
     scene: str | None
-    ends: str = Field(description="Expiry time in UTC, ISO 8601.")
-    address: str = Field(
-        description=("Viewer URL, relative to the service address. The part after # is never sent to a server.")
-    )
+    ends: str
+    """Expiry time in UTC, ISO 8601."""
+    address: str
+    """Viewer URL, relative to the service address. The part after # is never sent to a server."""
 
 
 class Node(Model):
@@ -75,16 +73,17 @@ class Node(Model):
 
     id: str
     host: str
-    labels: dict[str, str] = Field(
-        default_factory=dict, description="Labels given when the node was started, excluding Ray's own labels."
-    )
+    labels: dict[str, str] = Field(default_factory=dict)
+    """Labels given when the node was started, excluding Ray's own labels."""
     alive: bool
     cpus: float
-    cpus_reserved: float = Field(description="Estimated CPUs reserved by the processes of all services that respond.")
+    cpus_reserved: float
+    """Estimated CPUs reserved by the processes of all services that respond."""
     gpus: float
     memory_mb: float
     memory_reserved_mb: float
-    scenes: list[str] = Field(description="Scenes whose worker runs on this node.")
+    scenes: list[str]
+    """Scenes whose worker runs on this node."""
 
 
 class WaitingProcess(Model):
@@ -93,10 +92,8 @@ class WaitingProcess(Model):
     scene: str
     role: str
     needs: str
-    seconds: float = Field(
-        default=0.0,
-        description="How long the process has waited, in seconds. Starting without waiting takes a few seconds.",
-    )
+    seconds: float = 0.0
+    """How long the process has waited, in seconds. Starting without waiting takes a few seconds."""
 
 
 class Cluster(Model):
@@ -105,7 +102,5 @@ class Cluster(Model):
     placement: Literal["local", "ray"]
     nodes: list[Node]
     waiting: list[WaitingProcess]
-    head_responds: bool = Field(
-        default=True,
-        description="Whether the cluster's head node responds; if not, the nodes are those from its last response.",
-    )
+    head_responds: bool = True
+    """Whether the cluster's head node responds; if not, the nodes are those from its last response."""

@@ -59,13 +59,10 @@ class NoRequest(Model):
 class PartsSubscription(Model):
     """A subscription to part labels."""
 
-    count: int | None = Field(default=None, ge=1, le=254, description="Number of parts; default: chosen automatically.")
-    every: int = Field(
-        default=1,
-        ge=1,
-        le=1_000_000,
-        description="Number of frames between messages. Finding the parts keeps the reader busy for a while.",
-    )
+    count: int | None = Field(default=None, ge=1, le=254)
+    """Number of parts; default: chosen automatically."""
+    every: int = Field(default=1, ge=1, le=1_000_000)
+    """Number of frames between messages. Finding the parts keeps the reader busy for a while."""
 
 
 REQUESTS: dict[Topic, type[Model]] = {
@@ -118,10 +115,14 @@ CLIENT_MESSAGE: TypeAdapter[Subscribe | Update | Unsubscribe] = TypeAdapter(Clie
 class StreamLimits(Model):
     """The service's limits for one client."""
 
-    subscriptions: int = Field(description="Maximum number of subscriptions.")
-    message_bytes: int = Field(description="Maximum size of a client message in bytes.")
-    render_pixels: int = Field(description="Maximum number of pixels per view.")
-    track_points: int = Field(description="Maximum number of points × frames per tracks message.")
+    subscriptions: int
+    """Maximum number of subscriptions."""
+    message_bytes: int
+    """Maximum size of a client message in bytes."""
+    render_pixels: int
+    """Maximum number of pixels per view."""
+    track_points: int
+    """Maximum number of points × frames per tracks message."""
 
 
 class Hello(Model):
@@ -161,7 +162,8 @@ class SceneMessage(Model):
 
     type: Literal["scene"] = "scene"
     id: SubscriptionId
-    missed: int = Field(description="Number of unsent status changes that this message replaces.")
+    missed: int
+    """Number of unsent status changes that this message replaces."""
     status: SceneStatus
 
 
@@ -170,7 +172,8 @@ class FrameMessage(Model):
 
     type: Literal["frame"] = "frame"
     id: SubscriptionId
-    missed: int = Field(description="Number of unsent frame reports that this message replaces.")
+    missed: int
+    """Number of unsent frame reports that this message replaces."""
     report: FrameReportModel
 
 
@@ -199,26 +202,20 @@ class BinaryHead(Model):
     type: Literal["states", "render", "tracks", "parts"]
     id: SubscriptionId
     tag: Tag = None
-    missed: int = Field(
-        description="Number of unsent messages, for earlier frames or camera positions, that this one replaces."
-    )
-    frame: int = Field(
-        description="Frame of the state or view, last frame of the tracks, or newest frame of the parts."
-    )
-    first: int | None = Field(
-        default=None, description="Tracks only: first frame in the message; earlier frames were already sent."
-    )
-    after: int | None = Field(
-        default=None,
-        description="States only: frame that the records continue from; absent if they start a new compact file.",
-    )
-    age: float | None = Field(
-        default=None, description="States only: seconds from the commit to the sending of this message, if known."
-    )
-    media_type: str = Field(description="Media type of the body, as for the same request over HTTP.")
-    headers: dict[str, str] = Field(
-        default_factory=dict, description="HTTP response headers with lowercase names, e.g. x-depth-near."
-    )
+    missed: int
+    """Number of unsent messages, for earlier frames or camera positions, that this one replaces."""
+    frame: int
+    """Frame of the state or view, last frame of the tracks, or newest frame of the parts."""
+    first: int | None = None
+    """Tracks only: first frame in the message; earlier frames were already sent."""
+    after: int | None = None
+    """States only: frame that the records continue from; absent if they start a new compact file."""
+    age: float | None = None
+    """States only: seconds from the commit to the sending of this message, if known."""
+    media_type: str
+    """Media type of the body, as for the same request over HTTP."""
+    headers: dict[str, str] = Field(default_factory=dict)
+    """HTTP response headers with lowercase names, e.g. x-depth-near."""
 
 
 def pack(head: Model, body: bytes) -> bytes:

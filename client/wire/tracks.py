@@ -16,70 +16,63 @@ from client.wire.rigs import CameraModel
 class TracksRequest(Model):
     """A request for trajectories of exactly one of `ids`, `pixels` and `points`."""
 
-    ids: Annotated[list[int], Field(min_length=1)] | None = Field(default=None, description="Ids of Gaussians.")
-    pixels: Annotated[list[Pixel], Field(min_length=1)] | None = Field(
-        default=None,
-        description="Pixel coordinates (u, v) in the image of `camera`; (0.5, 0.5) is the centre of the first pixel.",
-    )
-    camera: CameraModel | str | None = Field(
-        default=None, description="Camera to whose image the pixels belong: any camera, or the name of one in the rig."
-    )
-    points: Annotated[list[Row3], Field(min_length=1)] | None = Field(
-        default=None, description="Points (x, y, z) in the rig's world frame and units."
-    )
-    at: int | None = Field(
-        default=None, ge=0, description="Frame to which the pixels or points refer; default: the first committed frame."
-    )
-    first: int | None = Field(default=None, ge=0, description="First frame; default: the first committed frame.")
-    last: int | None = Field(
-        default=None, ge=0, description="Last frame, inclusive; default: the last committed frame."
-    )
-    project: list[CameraModel | str] = Field(
-        default_factory=list,
-        max_length=64,
-        description="Cameras into which to project the trajectories, including visibility.",
-    )
+    ids: Annotated[list[int], Field(min_length=1)] | None = None
+    """Ids of Gaussians."""
+    pixels: Annotated[list[Pixel], Field(min_length=1)] | None = None
+    """Pixel coordinates (u, v) in the image of `camera`; (0.5, 0.5) is the centre of the first pixel."""
+    camera: CameraModel | str | None = None
+    """Camera to whose image the pixels belong: any camera, or the name of one in the rig."""
+    points: Annotated[list[Row3], Field(min_length=1)] | None = None
+    """Points (x, y, z) in the rig's world frame and units."""
+    at: int | None = Field(default=None, ge=0)
+    """Frame to which the pixels or points refer; default: the first committed frame."""
+    first: int | None = Field(default=None, ge=0)
+    """First frame; default: the first committed frame."""
+    last: int | None = Field(default=None, ge=0)
+    """Last frame, inclusive; default: the last committed frame."""
+    project: list[CameraModel | str] = Field(default_factory=list, max_length=64)
+    """Cameras into which to project the trajectories, including visibility."""
     format: Literal["json", "npz"] = "json"
 
 
 class TracksModel(Model):
     """Trajectories of Q points over T frames, in the rig's world frame and units."""
 
-    frames: list[int] = Field(description="[T] frame indices.")
-    times: list[float] = Field(description="[T] frame times in seconds.")
-    ids: list[int] = Field(description="[Q] id of the Gaussian that carries the point; −1 if the query hit nothing.")
-    confidence: list[list[float]] = Field(
-        description=(
-            "[Q][T] estimated probability, in [0, 1], that the position is within 1% of the extent of the true one "
-            "(docs/tracks.md); 0 if there is no position."
-        )
-    )
-    positions: list[list[list[float] | None]] = Field(
-        description="[Q][T] positions (x, y, z); null if the query hit nothing, or the Gaussian is unborn or retired."
-    )
-    visible: dict[str, list[list[bool]]] = Field(
-        default_factory=dict,
-        description="For each requested camera, [Q][T] whether the point is inside the image and not occluded.",
-    )
-    pixels: dict[str, list[list[list[float] | None]]] = Field(
-        default_factory=dict,
-        description="For each requested camera, [Q][T] pixels (u, v); null if the point is behind the camera.",
-    )
+    frames: list[int]
+    """[T] frame indices."""
+    times: list[float]
+    """[T] frame times in seconds."""
+    ids: list[int]
+    """[Q] id of the Gaussian that carries the point; −1 if the query hit nothing."""
+    confidence: list[list[float]]
+    """[Q][T] estimated probability, in [0, 1], that the position is within 1% of the extent of the true one
+    (docs/tracks.md); 0 if there is no position.
+    """
+    positions: list[list[list[float] | None]]
+    """[Q][T] positions (x, y, z); null if the query hit nothing, or the Gaussian is unborn or retired."""
+    visible: dict[str, list[list[bool]]] = Field(default_factory=dict)
+    """For each requested camera, [Q][T] whether the point is inside the image and not occluded."""
+    pixels: dict[str, list[list[list[float] | None]]] = Field(default_factory=dict)
+    """For each requested camera, [Q][T] pixels (u, v); null if the point is behind the camera."""
 
 
 class GaussianModel(Model):
     """The lifetime of one Gaussian, which is present from its birth, and from each revival, until it is retired."""
 
     id: int
-    born: int = Field(description="Frame in which the Gaussian was born; the first frame for initial Gaussians.")
-    retired: list[int] = Field(description="Frames in which the Gaussian was retired.")
-    revived: list[int] = Field(description="Frames in which the Gaussian was revived.")
+    born: int
+    """Frame in which the Gaussian was born; the first frame for initial Gaussians."""
+    retired: list[int]
+    """Frames in which the Gaussian was retired."""
+    revived: list[int]
+    """Frames in which the Gaussian was revived."""
 
 
 class GaussiansModel(Model):
     """Lifetimes of Gaussians in the requested order."""
 
-    frame: int = Field(description="The newest committed frame.")
+    frame: int
+    """The newest committed frame."""
     gaussians: list[GaussianModel]
 
 

@@ -25,37 +25,36 @@ class PointKind(StrEnum):
 class TradeoffPoint(Model):
     """Time, error and PSNR per frame for a number of iterations."""
 
-    kind: PointKind = Field(
-        description=(
-            "measured: from frames that the scene committed. replayed: from frames updated again in the "
-            "background with a different number of iterations. extrapolated: computed by `model` from the "
-            "measured points."
-        )
-    )
-    iterations: int = Field(description="Iterations per frame; rounded to two significant digits for measured points.")
-    milliseconds: float = Field(description="Median milliseconds per frame, from decoding to the end of the commit.")
-    error: float | None = Field(
-        description=(
-            "Mean image loss of the committed state on the probe views (at most four training views); "
-            "null if not measured or extrapolated."
-        )
-    )
-    psnr: float | None = Field(
-        description="PSNR in dB on the training views as last rendered; null if not measured or extrapolated."
-    )
-    frames: int = Field(description="Number of frames measured; 0 for extrapolated points.")
-    threads: int | None = Field(
-        description="Number of threads used for the update. Compare times only for equal numbers."
-    )
+    kind: PointKind
+    """measured: from frames that the scene committed. replayed: from frames updated again in the background with a
+    different number of iterations. extrapolated: computed by `model` from the measured points.
+    """
+    iterations: int
+    """Iterations per frame; rounded to two significant digits for measured points."""
+    milliseconds: float
+    """Median milliseconds per frame, from decoding to the end of the commit."""
+    error: float | None
+    """Mean image loss of the committed state on the probe views (at most four training views); null if not measured or
+    extrapolated.
+    """
+    psnr: float | None
+    """PSNR in dB on the training views as last rendered; null if not measured or extrapolated."""
+    frames: int
+    """Number of frames measured; 0 for extrapolated points."""
+    threads: int | None
+    """Number of threads used for the update. Compare times only for equal numbers."""
 
 
 class CurveMean(Model):
     """Mean loss and median time of updates after a given number of iterations."""
 
-    planned: int = Field(description="Total number of iterations of the update.")
+    planned: int
+    """Total number of iterations of the update."""
     iterations: int
-    milliseconds: float = Field(description="Median milliseconds since the update started, excluding decoding.")
-    loss: float = Field(description="Mean training loss over the iterations since the previous point.")
+    milliseconds: float
+    """Median milliseconds since the update started, excluding decoding."""
+    loss: float
+    """Mean training loss over the iterations since the previous point."""
     frames: int
 
 
@@ -64,7 +63,8 @@ class TimeModel(Model):
 
     fixed: float
     per_iteration: float
-    frames: int = Field(description="Number of frames used for the fit.")
+    frames: int
+    """Number of frames used for the fit."""
 
 
 class ReplayState(StrEnum):
@@ -80,43 +80,39 @@ class ReplayStatus(Model):
     """The latest replay, kept in memory until the service stops."""
 
     state: ReplayState = ReplayState.NONE
-    iterations: list[int] = Field(
-        default_factory=list, description="Iteration counts to measure; the scene's own count comes first."
-    )
-    frames: list[int] = Field(default_factory=list, description="Indices of the frames that are measured.")
-    warm_up: int | None = Field(
-        default=None, description="Index of the preceding frame, which serves as warm-up and is not measured."
-    )
+    iterations: list[int] = Field(default_factory=list)
+    """Iteration counts to measure; the scene's own count comes first."""
+    frames: list[int] = Field(default_factory=list)
+    """Indices of the frames that are measured."""
+    warm_up: int | None = None
+    """Index of the preceding frame, which serves as warm-up and is not measured."""
     threads: int | None = None
-    done: int = Field(default=0, description="Number of finished updates.")
+    done: int = 0
+    """Number of finished updates."""
     total: int = 0
-    error: str | None = Field(default=None, description="Reason why the replay failed.")
+    error: str | None = None
+    """Reason why the replay failed."""
 
 
 class TradeoffModel(Model):
     """Accuracy versus time for this scene on this machine."""
 
     scene: str
-    points: list[TradeoffPoint] = Field(description="Points, ordered by kind, then by iterations.")
-    curve: list[CurveMean] = Field(description="Mean progress during updates, for each measured budget.")
-    model: TimeModel | None = Field(description="Fitted time model; null until an update has been measured.")
-    budget: EffectiveBudget = Field(description="The budget for frames whose update has not started.")
+    points: list[TradeoffPoint]
+    """Points, ordered by kind, then by iterations."""
+    curve: list[CurveMean]
+    """Mean progress during updates, for each measured budget."""
+    model: TimeModel | None
+    """Fitted time model; null until an update has been measured."""
+    budget: EffectiveBudget
+    """The budget for frames whose update has not started."""
     replay: ReplayStatus
 
 
 class ReplayRequest(Model):
     """A request to replay frames with other iteration counts."""
 
-    iterations: Annotated[list[Iterations], Field(min_length=1, max_length=MOST_BUDGETS)] = Field(
-        default=[25, 50, 200],
-        description="Iterations per frame, one replay each. The scene's own iteration count is always measured too.",
-    )
-    frames: int = Field(
-        default=4,
-        strict=True,
-        ge=1,
-        le=MOST_REPLAYED,
-        description=(
-            "Number of newest frames to replay, after one warm-up frame. The frame log must still contain their images."
-        ),
-    )
+    iterations: Annotated[list[Iterations], Field(min_length=1, max_length=MOST_BUDGETS)] = Field(default=[25, 50, 200])
+    """Iterations per frame, one replay each. The scene's own iteration count is always measured too."""
+    frames: int = Field(default=4, strict=True, ge=1, le=MOST_REPLAYED)
+    """Number of newest frames to replay, after one warm-up frame. The frame log must still contain their images."""

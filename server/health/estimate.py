@@ -7,8 +7,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from client.wire import RigModel
-from client.wire.estimate import SceneEstimate
+from client.wire import RigModel, SceneEstimate
 from scas4d_core.settings import Settings
 from server.problems import Problem, count_noun
 from server.settings import ServerSettings

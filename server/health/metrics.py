@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections import Counter as Counts
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 from prometheus_client.core import GaugeMetricFamily, Metric
 
@@ -12,24 +13,16 @@ from client.wire import Cluster, SceneState, SceneStatus
 from server.settings import ServerSettings
 
 
+@dataclass(frozen=True, eq=False)
 class ServiceState:
     """Collector of the gauges of the service: scenes, queues, subscribers, disk and, if there is one, the cluster."""
 
-    def __init__(
-        self,
-        settings: ServerSettings,
-        scenes: Sequence[SceneStatus],
-        subscribers: int,
-        ready_after: float | None,
-        connections: Mapping[str, int],
-        cluster: Cluster | None = None,
-    ) -> None:
-        self.settings = settings
-        self.scenes = scenes
-        self.subscribers = subscribers
-        self.ready_after = ready_after
-        self.connections = connections
-        self.cluster = cluster
+    settings: ServerSettings
+    scenes: Sequence[SceneStatus]
+    subscribers: int
+    ready_after: float | None
+    connections: Mapping[str, int]
+    cluster: Cluster | None = None
 
     def collect(self) -> Iterator[Metric]:
         """Yields the gauges with their current values."""

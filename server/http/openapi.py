@@ -62,6 +62,9 @@ def openapi_document(app: FastAPI) -> dict[str, Any]:
                     operation["security"] = []
         for schema in written.get("components", {}).get("schemas", {}).values():
             simplify_tuples(schema)
+            for field in schema.get("properties", {}).values():
+                if "description" in field:  # wrapped like the docstring that it is
+                    field["description"] = " ".join(field["description"].split())
         if token:
             schemes = written.setdefault("components", {}).setdefault("securitySchemes", {})
             schemes["bearer"] = {"type": "http", "scheme": "bearer", "description": "The service's SCAS4D_TOKEN."}

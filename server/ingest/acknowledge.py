@@ -5,14 +5,15 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 from client.wire import FrameHead, FrameReceipt, FrameState, SceneCreate, SceneState
 from scas4d_core.cameras import Rig, minimum_cameras
 from scas4d_core.frame_times import ROWS, time_warnings
 from server import counters
+from server.background import shielded
 from server.hub import Publisher
 from server.keep_up import queue_limit
 from server.problems import Problem, count_noun
@@ -173,6 +174,7 @@ class Ingest:
         if (event := self._receiving.pop(index, None)) is not None:
             event.set()
 
+    @shielded
     async def accept(self, head: FrameHead, received: ReceivedFiles) -> FrameReceipt:
         """Acknowledges and queues a frame whose images are on disk; a known frame gets the same receipt again.
 
@@ -182,9 +184,6 @@ class Ingest:
         """
         while (before := self._receiving.get(head.index - 1)) is not None and head.index > self.ledger.next_frame:
             await before.wait()
-        return await shield_and_wait(self._accept(head, received))
-
-    async def _accept(self, head: FrameHead, received: ReceivedFiles) -> FrameReceipt:
         seconds = self.time_of(head.index, head.time)
         async with self.log.lock:
             if head.index < self.ledger.next_frame:
@@ -387,11 +386,3 @@ class Ingest:
             expected=self.ledger.next_frame,
             identity=entry.identity,
         )
-
-
-async def shield_and_wait(coroutine: Coroutine[Any, Any, T]) -> T:
-    """Runs a coroutine to completion even if the caller is cancelled.
-
-    A cancellation between journalling and updating the ledger would make them inconsistent.
-    """
-    return await asyncio.shield(asyncio.ensure_future(coroutine))

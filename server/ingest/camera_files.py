@@ -13,7 +13,7 @@ from scas4d_core.errors import InputError
 from scas4d_core.frame_times import check_time, time_error
 from server.ingest.acknowledge import Ingest
 from server.ingest.open_frames import OpenFrames
-from server.ingest.pictures import MASK, check_files, check_size
+from server.ingest.pictures import MASK, check_camera, check_files, check_size
 from server.ingest.receive import (
     BodyReader,
     accept_or_remove,
@@ -78,7 +78,7 @@ def form_frame(rig: Rig, index: int, fields: FormFields) -> tuple[FrameHead, lis
             )
     # Checked before creating a `FrameFile`, whose validation would raise for an invalid camera name.
     for name in given:
-        _check_camera(rig, name.removeprefix(MASK), name)
+        check_camera(rig, name.removeprefix(MASK), name)
     head = _head(index, time, [_file(name, upload.size or 0) for name, upload in given.items()], part=False)
     return head, list(given.values())
 
@@ -123,7 +123,7 @@ async def receive_file(
 ) -> CameraReceipt:
     """Receives the image or mask of one camera as a plain file."""
     ingest = frames.ingest
-    _check_camera(ingest.rules.rig, camera, "c")
+    check_camera(ingest.rules.rig, camera, "c")
     data = await _read(ingest.rules.rig[camera], camera, body, length)
     head = _head(index, time, [FrameFile(camera=camera, kind=kind, size=len(data))], part=True)
     frames.check_head(head, camera)
@@ -143,18 +143,6 @@ async def _read(camera: Camera, field: str, body: AsyncIterator[bytes], length: 
         return data
     finally:
         await drain(body)
-
-
-def _check_camera(rig: Rig, camera: str, field: str) -> None:
-    """Raises `Problem` (422) if the camera is not in the rig."""
-    if camera not in rig.names:
-        raise Problem(
-            422,
-            f"the rig has no camera {camera!r}",
-            field=field,
-            value=camera,
-            remedy=f"use one of {', '.join(rig.names)}",
-        )
 
 
 def _head(index: int, time: float | None, files: Sequence[FrameFile], *, part: bool) -> FrameHead:

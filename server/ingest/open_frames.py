@@ -12,8 +12,8 @@ from typing import Literal
 
 from client.wire import CameraReceipt, FileKind, FrameHead, FrameReceipt, FrameReportModel, FrameState
 from server import counters
-from server.background import Background
-from server.ingest.acknowledge import Ingest, ReceivedFiles, shield_and_wait
+from server.background import Background, shielded
+from server.ingest.acknowledge import Ingest, ReceivedFiles
 from server.problems import Problem, count_noun
 from server.storage.events import CameraAccepted, FrameMissing, JournalEvent, OpenFrame
 from server.storage.frame_store import FrameDamage, read_pictures
@@ -79,6 +79,7 @@ class OpenFrames:
                 remedy=f"send {frame.time!r} or no time; the first time sent applies to the frame",
             )
 
+    @shielded
     async def accept(self, head: FrameHead, camera: str, received: ReceivedFiles) -> CameraReceipt:
         """Acknowledges one camera's files of a frame.
 
@@ -86,9 +87,6 @@ class OpenFrames:
             Problem: see `Ingest.accept`; also 409 if the camera sent different content before, or if the frame was
                 closed without this file.
         """
-        return await shield_and_wait(self._accept(head, camera, received))
-
-    async def _accept(self, head: FrameHead, camera: str, received: ReceivedFiles) -> CameraReceipt:
         ledger, index, kinds = self._ledger, head.index, received.hashes[camera]
         closed = await self._camera_events_of(index) if index < ledger.next_frame else None
         async with self._log.lock:
@@ -123,7 +121,7 @@ class OpenFrames:
                 received.kept = True
                 counters.INGEST_BYTES.inc(received.size)
                 self._set_deadline(index)
-        await self._close_due()
+        await self.close_due()
         known = await self._camera_events_of(index) if index < ledger.next_frame else ledger.open[index]
         here = known.cameras if known is not None else []
         entry = ledger.frames.get(index)
@@ -162,11 +160,9 @@ class OpenFrames:
         self._overdue.add(index)
         self._background.run(self.close_due())
 
+    @shielded
     async def close_due(self) -> None:
         """Closes complete and overdue frames in order, as long as the queue has room."""
-        await shield_and_wait(self._close_due())
-
-    async def _close_due(self) -> None:
         ledger = self._ledger
         async with self._log.lock:
             while (frame := ledger.open.get(ledger.next_frame)) is not None and ledger.fatal is None:
@@ -179,6 +175,7 @@ class OpenFrames:
                     break
         self.ingest.updates.begin()
 
+    @shielded
     async def close(self, index: int) -> FrameReceipt:
         """Closes a frame on request with the images received so far; a closed frame gets the same receipt again.
 
@@ -186,9 +183,6 @@ class OpenFrames:
             Problem: 404 if no image has arrived; 409 if an earlier frame is not closed or fewer than the scene's
                 minimum number of cameras have sent an image; 429 and 507 as for `Ingest.accept`.
         """
-        return await shield_and_wait(self._close_on_request(index))
-
-    async def _close_on_request(self, index: int) -> FrameReceipt:
         ledger = self._ledger
         async with self._log.lock:
             if index < ledger.next_frame:
@@ -239,15 +233,13 @@ class OpenFrames:
         self._forget(frame.index)
         return receipt
 
+    @shielded
     async def declare_missing(self, index: int, reason: str) -> FrameReportModel:
         """Permanently declares the next frame missing; a repeated declaration gets the same response.
 
         Raises:
             Problem: 409 for a gap, an accepted frame or a failed scene; 507 if the disk is full.
         """
-        return await shield_and_wait(self._declare_missing(index, reason))
-
-    async def _declare_missing(self, index: int, reason: str) -> FrameReportModel:
         ledger = self._ledger
         async with self._log.lock:
             if index < ledger.next_frame:
@@ -280,7 +272,7 @@ class OpenFrames:
                 await self._log.delete_pictures(parts.files)
             report = ledger.frames[index].report
         self.ingest.publish_ended(index)
-        await self._close_due()
+        await self.close_due()
         return report
 
     def _forget(self, index: int) -> None:

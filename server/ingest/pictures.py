@@ -50,6 +50,18 @@ def check_size(camera: Camera, field: str, size: int) -> None:
         )
 
 
+def check_camera(rig: Rig, camera: str, field: str) -> None:
+    """Raises `Problem` (422) if the camera is not in the rig."""
+    if camera not in rig.names:
+        raise Problem(
+            422,
+            f"the rig has no camera {camera!r}",
+            field=field,
+            value=camera,
+            remedy=f"use one of {', '.join(rig.names)}",
+        )
+
+
 def check_files(rig: Rig, files: Sequence[FrameFile], *, whole: bool) -> None:
     """Checks that each file belongs to a camera of the rig and appears only once.
 
@@ -62,14 +74,7 @@ def check_files(rig: Rig, files: Sequence[FrameFile], *, whole: bool) -> None:
     seen: dict[FileKind, set[str]] = {FileKind.IMAGE: set(), FileKind.MASK: set()}
     for file in files:
         field = field_of(file)
-        if file.camera not in names:
-            raise Problem(
-                422,
-                f"the rig has no camera {file.camera!r}",
-                field=field,
-                value=file.camera,
-                remedy=f"use one of {', '.join(rig.names)}",
-            )
+        check_camera(rig, file.camera, field)
         if file.camera in seen[file.kind]:
             raise Problem(
                 422,

@@ -13,7 +13,8 @@ from blake3 import blake3
 
 from client.wire import FrameFile, FrameHead, FrameReceipt, FramingError, head_length, parse_head
 from client.wire.framing import PREFIX
-from server.ingest.acknowledge import Ingest, ReceivedFiles, shield_and_wait
+from server.background import shielded
+from server.ingest.acknowledge import Ingest, ReceivedFiles
 from server.ingest.pictures import check_files, check_picture
 from server.problems import Problem
 from server.storage.disk import full_disk, no_room
@@ -113,11 +114,9 @@ class FrameReceiver:
             else ReceivedFiles(self._hashes, upload.name, upload.size)
         )
 
+    @shielded
     async def abort(self) -> None:
-        """Removes the record, even if the caller is cancelled in the meantime."""
-        await asyncio.shield(asyncio.ensure_future(self._abort()))
-
-    async def _abort(self) -> None:
+        """Removes the record."""
         if self._at_work is not None:
             await asyncio.wait([self._at_work])  # the thread may still use the file and the buffers
         self._return_buffers()
@@ -349,32 +348,25 @@ def frame_receiver(ingest: Ingest, head: FrameHead, seconds: float | None, *, ke
     return FrameReceiver(ingest.log.pictures.folder, head, seconds, partial(check_picture, ingest.rules.rig), keep=keep)
 
 
+@shielded
 async def accept_or_remove(receiving: FrameReceiver, accept: Callable[[ReceivedFiles], Coroutine[Any, Any, T]]) -> T:
     """Finishes a record and accepts it, or removes it if it is refused.
 
     This runs to completion even if the request is cancelled, because a record must not be removed once an event
     references it.
     """
-
-    async def finish() -> T:
-        received = await _finish(receiving)
-        try:
-            return await accept(received)
-        finally:
-            if not received.kept:
-                await receiving.abort()
-
-    return await shield_and_wait(finish())
-
-
-async def _finish(receiving: FrameReceiver) -> ReceivedFiles:
     try:
-        return await receiving.finish()
+        received = await receiving.finish()
     except BaseException as error:
         await receiving.abort()
         if no_room(error) and isinstance(error, OSError):
             raise full_disk(error) from None
         raise
+    try:
+        return await accept(received)
+    finally:
+        if not received.kept:
+            await receiving.abort()
 
 
 async def drain(body: AsyncIterator[bytes]) -> None:

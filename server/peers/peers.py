@@ -6,13 +6,13 @@ import asyncio
 import logging
 import time
 from collections import OrderedDict
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from typing import TypeVar
 
 import httpx
 from pydantic import BaseModel, ValidationError
 
-from client.wire import Cluster, SceneList, SceneStatus
+from client.wire import Cluster, Node, SceneList, SceneStatus
 from server.http.permissions import ALL, Permission
 from server.http.sharing import LONGEST_SECONDS, Sharing
 from server.problems import Problem
@@ -201,6 +201,29 @@ class Peers:
                 "service %s rejects the token; set the same SCAS4D_TOKEN on all services in the cluster", address
             )
         return answer
+
+
+def merge_clusters(own: Cluster, others: Iterable[Cluster]) -> Cluster:
+    """Returns the cluster as this service sees it, with the reservations of all services added.
+
+    The waiting processes of all services are also included.
+    """
+    nodes, waiting = {node.id: node for node in own.nodes}, list(own.waiting)
+    for other in others:
+        waiting += other.waiting
+        for node in other.nodes:
+            nodes[node.id] = _merge_node(nodes[node.id], node) if node.id in nodes else node
+    return own.model_copy(update={"nodes": list(nodes.values()), "waiting": waiting})
+
+
+def _merge_node(node: Node, more: Node) -> Node:
+    return node.model_copy(
+        update={
+            "cpus_reserved": round(node.cpus_reserved + more.cpus_reserved, 3),
+            "memory_reserved_mb": round(node.memory_reserved_mb + more.memory_reserved_mb, 1),
+            "scenes": sorted({*node.scenes, *more.scenes}),
+        }
+    )
 
 
 def unreachable_problem(scene: str, *, refused: bool = False) -> Problem:

@@ -12,6 +12,7 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from server import problems
+from server.background import run_until_first
 from server.http.permissions import PERMISSION
 from server.peers.peers import PROXIED_HEADER, Peers, unreachable_problem
 from server.peers.websocket_proxy import proxy_websocket
@@ -107,16 +108,11 @@ class ProxyMiddleware:
             headers=headers,
             content=body.parts() if body.there else None,
         )
-        answering = asyncio.ensure_future(_forward_request(peers.client, request, owner, scene, send))
-        leaving = asyncio.ensure_future(body.hung_up())
-        try:
-            await asyncio.wait({answering, leaving}, return_when=asyncio.FIRST_COMPLETED)
-            if answering.done() and answering.result() == NOT_FOUND:  # of the scene or of a resource in it
-                await peers.check(owner, scene)
-        finally:
-            for task in (answering, leaving):
-                task.cancel()
-            await asyncio.gather(answering, leaving, return_exceptions=True)
+        answering, _ = await run_until_first(
+            _forward_request(peers.client, request, owner, scene, send), body.hung_up()
+        )
+        if not answering.cancelled() and answering.result() == NOT_FOUND:  # of the scene or of a resource in it
+            await peers.check(owner, scene)
 
 
 class _Body:

@@ -14,6 +14,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketExce
 from websockets.typing import Subprotocol
 
 from server import problems
+from server.background import run_until_first
 from server.connections.websocket import limit_messages
 from server.peers.peers import CONNECT_S, SILENT_S, unreachable_problem
 from server.problems import Problem
@@ -69,13 +70,7 @@ async def proxy_websocket(
     async with peer:
         assert (await receive())["type"] == "websocket.connect"
         await send({"type": "websocket.accept", "subprotocol": peer.subprotocol})
-        ends = {asyncio.ensure_future(_to_peer(peer, receive)), asyncio.ensure_future(_from_peer(peer, send))}
-        try:
-            await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            for end in ends:
-                end.cancel()
-            await asyncio.gather(*ends, return_exceptions=True)
+        await run_until_first(_to_peer(peer, receive), _from_peer(peer, send))
     return SWITCHED
 
 

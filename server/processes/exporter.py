@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Iterator
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,12 @@ from numpy.typing import NDArray
 from scas4d_core.errors import InputError, message_of, without_paths
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.storage.history import DamagedFrameError, History, HistoryError
-from server.messages import DamageFound, ExportEnded, ExportProgressed, ExportSpec
+from server.messages import DamageFound, ExportProgressed, ExportSpec
+from server.processes.background_job import run_job
 from server.processes.compact_answers import compact_head
-from server.processes.placement import enter_background, finish_background, use_one_thread
+from server.processes.placement import use_one_thread
 from server.storage.disk import free_bytes, no_room
 
-NICE = 15
-"""Niceness increment of the process, which leaves it about a tenth of a core shared with a scene's worker."""
 RESERVE_BYTES = 500_000_000
 """Free disk space in bytes that exports leave for scenes, enough for about a thousand frames."""
 
@@ -37,15 +37,13 @@ class DiskReserveError(RuntimeError):
 
 def main(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
     """Entry point of the process: runs one export; the service stops the process if the export is cancelled."""
-    enter_background(NICE)
-    fault: str | None = None
-    try:
-        _export(spec, connection)
-    except Exception as error:  # any failure in the core must be reported, and the service must keep running
+
+    def log_and_explain(error: Exception) -> str:
         known = isinstance(error, InputError | HistoryError | DiskReserveError) or no_room(error)
         log.warning("scene %s: an export failed: %s", spec.scene.folder.name, error, exc_info=not known)
-        fault = explain(error)
-    finish_background(connection, ExportEnded(fault))
+        return explain(error)
+
+    run_job(partial(_export, spec, connection), connection, log_and_explain)
 
 
 def explain(error: Exception) -> str:

@@ -7,16 +7,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import multiprocessing
 import os
 import queue
-import signal
 import threading
 import time
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
-from typing import Any, NoReturn, Protocol
+from typing import Any, Protocol
 
 from client.wire import Cluster
 from server.messages import Stop
@@ -75,29 +73,6 @@ def end_with_parent() -> None:
         os._exit(0)
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-def enter_background(nice: int) -> None:
-    """Prepares a background process: lowers its priority below that of updates and ties its lifetime to its parent.
-
-    Args:
-        nice: niceness increment.
-    """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the service decides when to stop
-    os.nice(nice)
-    end_with_parent()
-
-
-def finish_background(connection: Connection[Any, Any], ended: Any) -> NoReturn:
-    """Sends the last message of a background process, waits until the process is asked to stop, then exits.
-
-    Exiting earlier would be treated as a crash.
-    """
-    with contextlib.suppress(EOFError, OSError):  # the service is gone
-        connection.send(ended)
-        logging.shutdown()
-        connection.recv()
-    os._exit(0)
 
 
 def use_one_thread() -> None:

@@ -9,12 +9,11 @@ from typing import Any
 
 from scas4d_core.errors import message_of
 from scas4d_core.storage.history import History
-from server.messages import DamageFound, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated
+from server.messages import DamageFound, ReplayPoint, ReplaySpec, ReplayUpdated
+from server.processes.background_job import run_job
 from server.processes.decoder import FrameDecoder, read
-from server.processes.placement import enter_background, finish_background, use_one_thread
+from server.processes.placement import use_one_thread
 
-NICE = 15
-"""Niceness increment of the process, which leaves it about a tenth of a core shared with a scene's worker."""
 THREADS = 1
 """Number of threads used by a replay; the other cores are left to the worker."""
 
@@ -23,14 +22,12 @@ log = logging.getLogger("scas4d.replayer")
 
 def main(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
     """Entry point of the process: runs one replay; the service stops the process if the result is no longer needed."""
-    enter_background(NICE)
-    fault: str | None = None
-    try:
-        _replay(spec, connection)
-    except Exception as error:  # any failure in the core must be reported, and the service must keep running
+
+    def explain(error: Exception) -> str:
         log.exception("scene %s: the replay failed", spec.scene.folder.name)
-        fault = f"{type(error).__name__}: {message_of(error)}"
-    finish_background(connection, ReplayEnded(fault))
+        return f"{type(error).__name__}: {message_of(error)}"
+
+    run_job(partial(_replay, spec, connection), connection, explain)
 
 
 def _replay(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Hashable
-from dataclasses import fields, is_dataclass
-from typing import Any, Protocol, TypeVar
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any
 
 import numpy as np
 
+from client.wire.stream import BinaryHead
 from server.processes.queries import Answer, Query, RenderQuery, StatesQuery
 
 QUERIES_AT_ONCE = 2
@@ -25,19 +26,21 @@ KEPT_BYTES = 32_000_000
 AskReaders = Callable[[Query], Awaitable[Answer]]
 
 
-class SharedQuery(Protocol):
-    """Query that can be shared by all subscribers that would get the same answer."""
+@dataclass(frozen=True)
+class SharedQuery:
+    """Query of a live subscription at one point in time.
 
-    @property
-    def key(self) -> Hashable:
-        """Cache key, which is equal for queries with the same answer."""
+    Attributes:
+        key: cache key, which is equal for all subscribers that would get the same answer.
+        query: query to send to the readers.
+        head: head of the message with the answer; its media type and headers are filled in from the answer.
+        changes: number of changes that the answer covers.
+    """
 
-    @property
-    def query(self) -> Query:
-        """Query to send to the readers."""
-
-
-Q = TypeVar("Q", bound=SharedQuery)
+    key: Hashable
+    query: Query
+    head: BinaryHead
+    changes: int
 
 
 def fingerprint(value: Any) -> Hashable:
@@ -51,8 +54,6 @@ def fingerprint(value: Any) -> Hashable:
         return (value.shape, value.dtype.str, value.tobytes())
     if isinstance(value, list | tuple):
         return tuple(fingerprint(one) for one in value)
-    if isinstance(value, dict):
-        return tuple((name, fingerprint(value[name])) for name in sorted(value))
     hashable: Hashable = value
     return hashable
 
@@ -83,7 +84,7 @@ class SharedQueries:
         self.asked = 0
         """Number of queries sent to the readers so far."""
 
-    async def answer(self, question: Callable[[], Q]) -> tuple[Q, Answer]:
+    async def answer(self, question: Callable[[], SharedQuery]) -> tuple[SharedQuery, Answer]:
         """Returns the query and its answer; `question` builds the query just before it is sent.
 
         Raises:

@@ -120,7 +120,6 @@ class Worker:
         """Resumes from the committed states and reports them; returns False if that fails."""
         try:
             self.states = history = History.open(self.spec.folder.states)
-            undone: tuple[int, ...] = ()
             faults: tuple[str, ...] = ()
             if history.indices:
                 from scas4d_core.reconstruction import Reconstruction  # imported lazily: not needed by the service
@@ -131,11 +130,10 @@ class Worker:
                     self.spec.rig, self.spec.settings, history, held=lambda index: has_record(self._pictures, index)
                 )
                 if self.reconstruction.resumed is not None:
-                    undone = tuple(self.reconstruction.resumed.undone)
                     faults = tuple(self.reconstruction.resumed.faults)
                 faults += tuple(repair_at_start(history))
             report = history.report(history.indices[-1]) if history.indices else {}
-            self.send(Ready(tuple(history.indices), dict(history.damaged), report, undone, faults))
+            self.send(Ready(tuple(history.indices), dict(history.damaged), report, faults))
         except (HistoryError, ValueError) as error:  # damaged data raises ValueError
             log.exception("scene %s: cannot resume from the committed states", self.spec.folder.name)
             self.send(ResumeFailed(f"{type(error).__name__}: {message_of(error)}"))

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import difflib
 from collections.abc import AsyncIterator
-from typing import Annotated
+from typing import Annotated, Any
 from urllib.parse import parse_qsl
 
 from fastapi import Depends, Path, Request, params
@@ -14,6 +12,7 @@ from fastapi.dependencies.utils import get_flat_params
 from fastapi.routing import APIRoute
 from starlette.requests import HTTPConnection
 
+from server.background import run_until_first
 from server.problems import Problem
 from server.processes.queries import Answer, Query
 from server.scene.exports import Exports
@@ -22,37 +21,31 @@ from server.scene.scenes import Scenes
 from server.settings import ServerSettings
 
 
-def _scenes(request: Request) -> Scenes:
-    scenes: Scenes = request.app.state.scenes
-    return scenes
+def _of_app(name: str) -> Any:
+    """Returns the dependency that reads an attribute of the application's state."""
+
+    def read(request: Request) -> Any:
+        return getattr(request.app.state, name)
+
+    return Depends(read)
 
 
-def _exports(request: Request) -> Exports:
-    exports: Exports = request.app.state.exports
-    return exports
-
-
-def _settings(request: Request) -> ServerSettings:
-    settings: ServerSettings = request.app.state.settings
-    return settings
-
-
+AllScenes = Annotated[Scenes, _of_app("scenes")]
+AllExports = Annotated[Exports, _of_app("exports")]
+TheSettings = Annotated[ServerSettings, _of_app("settings")]
 SceneId = Annotated[str, Path(max_length=64)]
 
 
-async def _scene(request: Request, id: SceneId) -> AsyncIterator[Scene]:
-    async with _scenes(request).use(id) as scene:
+async def _scene(scenes: AllScenes, id: SceneId) -> AsyncIterator[Scene]:
+    async with scenes.use(id) as scene:
         yield scene
 
 
-async def _record(request: Request, id: SceneId) -> AsyncIterator[Scene]:
-    async with _scenes(request).use(id, place=False) as scene:
+async def _record(scenes: AllScenes, id: SceneId) -> AsyncIterator[Scene]:
+    async with scenes.use(id, place=False) as scene:
         yield scene
 
 
-AllScenes = Annotated[Scenes, Depends(_scenes)]
-AllExports = Annotated[Exports, Depends(_exports)]
-TheSettings = Annotated[ServerSettings, Depends(_settings)]
 TheScene = Annotated[Scene, Depends(_scene)]
 """Scene for routes that need its processes; the scene is woken up and takes a slot."""
 TheRecord = Annotated[Scene, Depends(_record)]
@@ -101,18 +94,11 @@ async def ask(request: Request, scene: Scene, query: Query) -> Answer:
     Raises:
         Problem: see `Readers.ask`; 503 if the client has closed the connection.
     """
-    asking = asyncio.ensure_future(scene.readers.ask(query))
-    leaving = asyncio.ensure_future(_hung_up(request))
-    try:
-        await asyncio.wait({asking, leaving}, return_when=asyncio.FIRST_COMPLETED)
-        if asking.done():
-            return asking.result()
-    finally:
-        for task in (asking, leaving):
-            task.cancel()
-            with contextlib.suppress(asyncio.CancelledError, Exception):
-                await task
-    raise Problem(503, "the client closed the connection", remedy="send the request again")
+    asking, leaving = await run_until_first(scene.readers.ask(query), _hung_up(request))
+    if asking.cancelled() and not leaving.cancelled():
+        raise Problem(503, "the client closed the connection", remedy="send the request again")
+    answer: Answer = asking.result()
+    return answer
 
 
 async def _hung_up(request: Request) -> None:

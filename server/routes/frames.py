@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 from bisect import bisect_left, bisect_right
-from collections.abc import AsyncIterator
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Request, Response
@@ -20,6 +21,7 @@ from client.wire import (
     FrameSeconds,
     MissingRequest,
 )
+from client.wire.frames import FrameList
 from server.http.immutable import immutable_response
 from server.ingest.batch import REFUSED_CONTENT, Batch, Numbering, OnRefusal, receive_batch, receive_form_batch
 from server.ingest.camera_files import receive_camera, receive_file, receive_form
@@ -33,58 +35,41 @@ from server.storage.frame_store import FrameDamage, read_pictures
 router = APIRouter(prefix="/v1/scenes", tags=["frames"])
 
 BINARY = {"type": "string", "format": "binary"}
-BODY: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            FRAME_MEDIA_TYPE: {"schema": {**BINARY, "description": "S4DF, described in docs/api.md."}},
-            "multipart/form-data": {
-                "schema": {
-                    "type": "object",
-                    "properties": {"time": {"type": "number", "description": "Frame time in seconds; optional."}},
-                    "additionalProperties": {
-                        **BINARY,
-                        "description": "Image of the camera with the name of the field; `mask.<camera>` is its mask.",
-                    },
-                }
-            },
-        },
-    }
-}
-BATCH_BODY: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            FRAME_MEDIA_TYPE: {
-                "schema": {**BINARY, "description": "S4DF frames, one after another, as described in docs/api.md."}
-            },
-            "multipart/form-data": {
-                "schema": {
-                    "type": "object",
-                    "additionalProperties": {
-                        **BINARY,
-                        "description": (
-                            "A field as for a single frame, with the frame index before its name: `0/<camera>`, "
-                            "`0/mask.<camera>`, `0/time`."
-                        ),
-                    },
-                }
-            },
-        },
-    }
-}
+
+
+def _request_body(frames: str, others: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Returns the description of a body of S4DF frames, or of another media type with the schema given for it."""
+    schemas = {**others, FRAME_MEDIA_TYPE: {**BINARY, "description": frames}}
+    return {"requestBody": {"required": True, "content": {kind: {"schema": schemas[kind]} for kind in schemas}}}
+
+
+def _form(files: str, **fields: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    schema = {"type": "object", "additionalProperties": {**BINARY, "description": files}}
+    return {"multipart/form-data": schema | ({"properties": fields} if fields else {})}
+
+
+BODY = _request_body(
+    "S4DF, described in docs/api.md.",
+    _form(
+        "Image of the camera with the name of the field; `mask.<camera>` is its mask.",
+        time={"type": "number", "description": "Frame time in seconds; optional."},
+    ),
+)
+BATCH_BODY = _request_body(
+    "S4DF frames, one after another, as described in docs/api.md.",
+    _form(
+        "A field as for a single frame, with the frame index before its name: `0/<camera>`, `0/mask.<camera>`, "
+        "`0/time`."
+    ),
+)
 ANSWERS: dict[int | str, dict[str, Any]] = {
     207: {"model": FrameBatch, "description": "At least one frame was refused; see its `problem`."}
 }
-PICTURE: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            **{kind: {"schema": BINARY} for kind in ("image/jpeg", "image/png", "image/webp")},
-            FRAME_MEDIA_TYPE: {"schema": {**BINARY, "description": "Image and mask of the camera in one body."}},
-        },
-    }
-}
+PICTURE = _request_body(
+    "Image and mask of the camera in one body.", dict.fromkeys(("image/jpeg", "image/png", "image/webp"), BINARY)
+)
+MOST_FRAMES = 500
+"""Maximum number of frames per response; each report lists every camera."""
 MOST_STATES = 120
 """Maximum number of frames in a requested compact file; they take a few seconds of reader time and a few megabytes."""
 SENT_AS = {
@@ -115,13 +100,11 @@ async def put(scene: TheScene, n: FrameIndex, request: Request) -> FrameReceipt:
     response is 507.
     """
     kind = _media_type(request)
-    try:
+    with _connected("frame"):
         if kind == FRAME_MEDIA_TYPE:
-            return await receive_frame(scene.ingest, n, _body(request), _length(request))
+            return await receive_frame(scene.ingest, n, request.stream(), _length(request))
         if kind == "multipart/form-data":
             return await receive_form(scene.ingest, n, request)
-    except ClientDisconnect:
-        raise Problem(400, "the sender closed the connection", field="body", remedy="send the frame again") from None
     raise _media_type_problem(request)
 
 
@@ -149,15 +132,13 @@ async def post(
     for frames that were accepted before.
     """
     kind = _media_type(request)
-    try:
+    with _connected("batch"):
         if kind == FRAME_MEDIA_TYPE:
-            batch = await receive_batch(scene.open_frames, numbering, on_refusal, _body(request))
+            batch = await receive_batch(scene.open_frames, numbering, on_refusal, request.stream())
         elif kind == "multipart/form-data":
             batch = await receive_form_batch(scene.open_frames, numbering, on_refusal, request)
         else:
             raise _media_type_problem(request)
-    except ClientDisconnect:
-        raise Problem(400, "the sender closed the connection", field="body", remedy="send the batch again") from None
     return _answer(batch, response)
 
 
@@ -186,12 +167,10 @@ async def put_camera(
     The image is on disk when the response is sent. The frame closes when the images of all cameras have arrived, on
     POST …/close, or at the scene's deadline. A camera may be a few frames ahead of the others. Frames close in order.
     """
-    try:
+    with _connected("image"):
         if _media_type(request) == FRAME_MEDIA_TYPE:
-            return await receive_camera(scene.open_frames, n, c, _body(request), _length(request))
-        return await receive_file(scene.open_frames, n, c, kind, time, _body(request), _length(request))
-    except ClientDisconnect:
-        raise Problem(400, "the sender closed the connection", field="body", remedy="send the image again") from None
+            return await receive_camera(scene.open_frames, n, c, request.stream(), _length(request))
+        return await receive_file(scene.open_frames, n, c, kind, time, request.stream(), _length(request))
 
 
 @router.get("/{id}/frames/{n}/cameras/{c}", response_class=Response, responses=FILE)
@@ -226,6 +205,19 @@ async def missing(scene: TheScene, n: FrameIndex, request: MissingRequest | None
     Images of the frame that have already arrived are discarded. The next update spans the longer time interval.
     """
     return await scene.open_frames.declare_missing(n, "" if request is None else request.reason)
+
+
+@router.get("/{id}/frames")
+async def frames(
+    scene: TheScene,
+    first: Annotated[int, Query(ge=0, le=1_000_000_000, description="Index of the first frame.")] = 0,
+    limit: Annotated[int, Query(ge=1, le=MOST_FRAMES, description="Maximum number of frames.")] = MOST_FRAMES,
+) -> FrameList:
+    """Returns the reports of up to `limit` frames starting at `first`; `next` is the `first` of the next page."""
+    after = min(first + limit, scene.next_frame)  # frame indices have no gaps
+    reports = [await scene.report(index) for index in range(first, after)]
+    short = [report.model_copy(update={"loss": [], "curve": []}) for report in reports if report is not None]
+    return FrameList(frames=short, next=after if first <= after < scene.next_frame else None)
 
 
 @router.get("/{id}/frames/{n}")
@@ -342,8 +334,13 @@ def _media_type_problem(request: Request) -> Problem:
     )
 
 
-def _body(request: Request) -> AsyncIterator[bytes]:
-    return request.stream()
+@contextmanager
+def _connected(what: str) -> Iterator[None]:
+    """Raises `Problem` (400) if the sender closes the connection while it sends `what`."""
+    try:
+        yield
+    except ClientDisconnect:
+        raise Problem(400, "the sender closed the connection", field="body", remedy=f"send the {what} again") from None
 
 
 def _length(request: Request) -> int | None:

@@ -1,17 +1,18 @@
-"""Routes that create, list, inspect, edit, pause, resume, put to sleep and delete scenes."""
+"""Routes that create, list, inspect, edit, pause, resume, restart, put to sleep and delete scenes."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Annotated
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Path, Request, Response
 
-from client.wire import SceneCreate, SceneEdit, SceneList, SceneStatus
+from client.wire import ReconstructionRequest, RigModel, SceneCreate, SceneEdit, SceneList, SceneStatus
 from scas4d_core.cameras import CameraError
 from scas4d_core.engines.choose import free_gpu_mb, gpu_fault
-from scas4d_core.presets import SettingError, preset
+from scas4d_core.presets import SettingError, changed, preset
 from scas4d_core.rig_checks import RigError, check_scene
 from scas4d_core.settings import Settings
 from server.health import estimate
@@ -21,9 +22,12 @@ from server.peers.peers import PROXIED_HEADER, Peers
 from server.problems import Problem, rig_problem
 from server.processes.placement import Placement
 from server.routes.access import AllExports, AllScenes, SceneId, TheRecord, TheScene, TheSettings
+from server.scene.new_reconstruction import NewReconstruction
 from server.settings import ServerSettings
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
+
+Number = Annotated[int, Path(ge=1, le=1_000_000_000, description="The scene's `reconstruction` + 1.")]
 
 
 def scene_settings(request: SceneCreate) -> Settings:
@@ -138,6 +142,12 @@ async def inspect(id: SceneId, scenes: AllScenes) -> SceneStatus:
     return scenes.status(id)
 
 
+@router.get("/{id}/rig")
+async def rig(scene: TheRecord) -> RigModel:
+    """Returns the camera rig of the scene as uploaded, without calibration corrections."""
+    return scene.request.rig
+
+
 @router.patch("/{id}")
 async def edit(id: SceneId, scenes: AllScenes, request: SceneEdit) -> SceneStatus:
     """Renames, archives or unarchives the scene, or changes how many images and states it keeps.
@@ -162,6 +172,32 @@ async def resume(scene: TheScene) -> SceneStatus:
     """Resumes the scene with the queued frames."""
     await scene.pause(False)
     return scene.status()
+
+
+@router.put("/{id}/reconstructions/{n}")
+async def put(
+    scene: TheScene,
+    n: Number,
+    scenes: AllScenes,
+    server: TheSettings,
+    exports: AllExports,
+    request: ReconstructionRequest | None = None,
+) -> SceneStatus:
+    """Restarts the reconstruction of a scene, e.g. after a first frame that failed or has poor quality.
+
+    The new reconstruction replaces the previous one; its committed states and exports are deleted. All frames
+    whose images are still stored are reconstructed again in order. The restart is on disk when the response is sent.
+    Repeating the request returns the same response.
+    """
+    asked = request or ReconstructionRequest()
+    with setting_problems():
+        settings = changed(scene.spec.settings, asked.settings)
+    await check_settings(scene.request, settings, server, scenes.placement)
+    begun = scene.ledger.reconstruction < n
+    status = await scenes.begin_again(scene, NewReconstruction(n, asked, settings, scene.rig))
+    if begun:
+        await exports.forget(scene.id)
+    return status
 
 
 @router.post("/{id}/sleep")

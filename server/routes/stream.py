@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import logging
 import time
@@ -12,6 +11,7 @@ from starlette.websockets import WebSocketDisconnect, WebSocketState
 
 from client.wire.stream import STREAM_PROTOCOL, TOO_BIG
 from server import problems
+from server.background import run_until_first
 from server.connections.websocket import limit_messages
 from server.http.permissions import ALL, PERMISSION
 from server.hub import Hub
@@ -61,19 +61,14 @@ def _require_protocol(websocket: WebSocket) -> None:
 async def _serve(websocket: WebSocket, subscriber: Subscriber, end: float | None) -> None:
     """Serves the connection until the client or the service closes it, or the client's permission expires."""
     await subscriber.greet()
-    reading = asyncio.create_task(_read(websocket, subscriber))
-    writing = asyncio.create_task(_write(websocket, subscriber))
-    try:
-        seconds = None if end is None else max(0.0, end - time.time())
-        done, _ = await asyncio.wait((reading, writing), timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
-        if not done:
-            await websocket.close(1008, "the link has expired")
-    finally:
-        for task in (reading, writing):
-            task.cancel()
-        for ended in await asyncio.gather(reading, writing, return_exceptions=True):
-            if isinstance(ended, Exception) and not isinstance(ended, WebSocketDisconnect):
-                log.error("scene %s: a stream failed", subscriber.scene.id, exc_info=ended)
+    seconds = None if end is None else max(0.0, end - time.time())
+    tasks = await run_until_first(_read(websocket, subscriber), _write(websocket, subscriber), seconds=seconds)
+    ended = [task for task in tasks if not task.cancelled()]
+    if not ended:
+        await websocket.close(1008, "the link has expired")
+    for task in ended:
+        if (error := task.exception()) is not None and not isinstance(error, WebSocketDisconnect):
+            log.error("scene %s: a stream failed", subscriber.scene.id, exc_info=error)
 
 
 async def _read(websocket: WebSocket, subscriber: Subscriber) -> None:

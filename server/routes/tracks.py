@@ -1,4 +1,4 @@
-"""Routes for point tracks; docs/tracks.md describes the responses."""
+"""Routes for point tracks and the lifetimes of Gaussians; docs/tracks.md describes the responses."""
 
 from __future__ import annotations
 
@@ -7,27 +7,29 @@ from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 
-from client.wire import TracksModel, TracksRequest
+from client.wire import GaussiansModel, TracksModel, TracksRequest
 from server.problems import Problem
-from server.queries.tracks import tracks_query
+from server.processes.queries import GaussiansQuery
+from server.queries.tracks import check_ids, tracks_query
 from server.routes.access import FirstFrame, LastFrame, TheScene, ask
 from server.scene.scene import Scene
 
-router = APIRouter(prefix="/v1/scenes", tags=["tracks"])
+router = APIRouter(prefix="/v1/scenes")
 
 Many = Annotated[list[str] | None, Query(max_length=1024)]
 ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {"model": TracksModel, "content": {"application/vnd.numpy.npz": {}}, "description": "Tracks as JSON or npz."}
 }
+LIFETIMES: dict[int | str, dict[str, Any]] = {200: {"model": GaussiansModel}}
 
 
-@router.post("/{id}/tracks/query", response_class=Response, responses=ANSWERS)
+@router.post("/{id}/tracks/query", response_class=Response, responses=ANSWERS, tags=["tracks"])
 async def query(scene: TheScene, http: Request, request: TracksRequest) -> Response:
     """Returns world-space trajectories of Gaussians, given by id, or of pixels or 3D points."""
     return await answer(http, scene, request)
 
 
-@router.get("/{id}/tracks", response_class=Response, responses=ANSWERS)
+@router.get("/{id}/tracks", response_class=Response, responses=ANSWERS, tags=["tracks"])
 async def tracks(
     scene: TheScene,
     http: Request,
@@ -58,6 +60,20 @@ async def tracks(
         format=format,
     )
     return await answer(http, scene, request)
+
+
+@router.get("/{id}/gaussians", response_class=Response, responses=LIFETIMES, tags=["gaussians"])
+async def gaussians(
+    scene: TheScene,
+    request: Request,
+    ids: Annotated[str, Query(min_length=1, max_length=10_000, description="Ids of Gaussians, separated by commas.")],
+) -> Response:
+    """Returns the frames in which Gaussians were created, retired and revived; ids are never reused."""
+    scene.committed_frame(None, "id")
+    wanted = ids_in(ids)
+    check_ids(wanted)
+    lifetimes = await ask(request, scene, GaussiansQuery(tuple(wanted)))
+    return Response(lifetimes.body, media_type=lifetimes.media_type)
 
 
 async def answer(http: Request, scene: Scene, request: TracksRequest) -> Response:

@@ -20,10 +20,11 @@ from typing import Any
 from client.wire import ExportModel, ExportRequest, ExportState
 from client.wire.exports import SUFFIXES
 from scas4d_core.errors import message_of
-from server.messages import DamageFound, ExportEnded, ExportProgressed, ExportSpec
+from server.messages import DamageFound, ExportProgressed, ExportSpec
 from server.problems import Problem, count_noun
 from server.processes import exporter
-from server.processes.placement import Placement, ProcessExit
+from server.processes.background_job import wait_for_job
+from server.processes.placement import Placement
 from server.scene.scene import Scene
 from server.scene.scenes import Scenes
 from server.storage.disk import free_bytes
@@ -239,7 +240,8 @@ class Exports:
             async with self._turns:
                 await asyncio.to_thread(folder.mkdir, parents=True)
                 export.state = ExportState.RUNNING
-                fault = await self._run_process(export)
+                receive = partial(self._on_message, export)
+                fault = await wait_for_job(self._placement, exporter.main, export.spec, receive, "export")
             if fault is None:
                 export.size = (await asyncio.to_thread(export.spec.file.stat)).st_size
         except Exception as error:
@@ -259,24 +261,7 @@ class Exports:
         for one in failed[:-MAX_PER_SCENE]:
             self._drop(one)
 
-    async def _run_process(self, export: Export) -> str | None:
-        """Runs an export's process and returns the reason if it fails, or None on success."""
-        ended: asyncio.Future[str | None] = asyncio.get_running_loop().create_future()
-
-        def end(fault: str | None) -> None:
-            if not ended.done():
-                ended.set_result(fault)
-
-        def gone(reason: ProcessExit) -> None:
-            end(f"the export process exited unexpectedly ({reason})")
-
-        process = self._placement.start(exporter.main, export.spec, partial(self._on_message, export, end), gone)
-        try:
-            return await ended
-        finally:
-            await asyncio.shield(process.stop(1.0 if ended.done() and not ended.cancelled() else 0))
-
-    def _on_message(self, export: Export, end: Any, message: Any) -> None:
+    def _on_message(self, export: Export, message: Any) -> None:
         match message:
             case ExportProgressed():
                 export.done, export.size = message.done, message.size
@@ -284,8 +269,6 @@ class Exports:
                 scene = self._scenes.awake.get(export.scene)
                 if scene is not None and scene.has_place:  # for a sleeping scene, the next scrub finds the damage
                     scene.repair_queue.report_damage(message.files)
-            case ExportEnded():
-                end(message.fault)
 
     def _drop(self, export: Export) -> None:
         """Removes a finished export from the list and cancels its timer."""

@@ -6,16 +6,18 @@ are kept in memory.
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from client.wire import PointKind, ReplayRequest, ReplayState, ReplayStatus, TradeoffPoint
-from server.background import Background
-from server.messages import DamageFound, FrameReady, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated, SceneSpec
+from scas4d_core.errors import message_of
+from server.messages import DamageFound, FrameReady, ReplayPoint, ReplaySpec, ReplayUpdated, SceneSpec
 from server.problems import Problem, count_noun
 from server.processes import replayer
-from server.processes.placement import Placement, ProcessExit, ProcessHandle
+from server.processes.background_job import wait_for_job
+from server.processes.placement import Placement
 from server.scene.status import effective_budget
 from server.storage.ledger import Ledger
 
@@ -33,7 +35,6 @@ class Replays:
         ledger: the scene's ledger.
         placement: placement used to start the replay processes.
         damaged: callback for unreadable files; receives the reason for each, keyed by file name.
-        background: the scene's background tasks.
 
     Attributes:
         status: status of the newest replay.
@@ -46,22 +47,19 @@ class Replays:
         ledger: Ledger,
         placement: Placement,
         damaged: Callable[[Mapping[str, str]], None],
-        background: Background,
     ) -> None:
         self._spec = spec
         self._ledger = ledger
         self._placement = placement
         self._damaged = damaged
-        self._background = background
-        self._process: ProcessHandle | None = None
-        self._life: object = None
+        self._task: asyncio.Task[None] | None = None
         self.status = ReplayStatus()
         self.points: dict[int, TradeoffPoint] = {}
 
     @property
     def busy(self) -> bool:
         """Whether a replay is running."""
-        return self._process is not None
+        return self._task is not None and not self._task.done()
 
     def start(self, request: ReplayRequest) -> None:
         """Starts a replay in a separate process.
@@ -71,7 +69,7 @@ class Replays:
                 available.
         """
         id = self._ledger.scene
-        if self._process is not None:
+        if self.busy:
             raise Problem(
                 409,
                 f"a replay is already running: {self.status.done} of {count_noun(self.status.total, 'update')}",
@@ -84,13 +82,6 @@ class Replays:
         iterations = tuple(dict.fromkeys([own, *request.iterations]))
         messages = tuple(self._message(index) for index in indices)
         spec = ReplaySpec(self._spec, self._ledger.committed[0], base, messages, iterations)
-        self._life = life = object()
-        self._process = self._placement.start(
-            replayer.main,
-            spec,
-            lambda message: self._on_message(life, message),
-            lambda reason: self._on_end(life, reason),
-        )
         self.status = ReplayStatus(
             state=ReplayState.RUNNING,
             iterations=list(iterations),
@@ -99,6 +90,7 @@ class Replays:
             threads=replayer.THREADS,
             total=len(iterations) * len(indices),
         )
+        self._task = asyncio.create_task(self._run(spec))
 
     def _chosen(self, count: int) -> tuple[int, list[int]]:
         """Chooses the frames of a replay of `count` measured updates.
@@ -166,9 +158,19 @@ class Replays:
         assert receipt is not None  # always set for a frame with files
         return FrameReady(index, receipt.time, entry.files, receipt.identity)
 
-    def _on_message(self, life: object, message: Any) -> None:
-        if life is not self._life:
-            return
+    async def _run(self, spec: ReplaySpec) -> None:
+        """Runs the replay process and records the outcome."""
+        try:
+            fault = await wait_for_job(self._placement, replayer.main, spec, self._on_message, "replay")
+        except Exception as error:
+            log.exception("scene %s: a replay failed", self._ledger.scene)
+            fault = f"internal error: {type(error).__name__}: {message_of(error)}"
+        if fault is not None:
+            log.error("scene %s: a replay failed: %s", self._ledger.scene, fault)
+        self.status.state = ReplayState.DONE if fault is None else ReplayState.FAILED
+        self.status.error = fault
+
+    def _on_message(self, message: Any) -> None:
         match message:
             case DamageFound():
                 self._damaged(message.files)
@@ -187,34 +189,16 @@ class Replays:
                     frames=message.frames,
                     threads=replayer.THREADS,
                 )
-            case ReplayEnded():
-                self._finish(message.fault)
-
-    def _on_end(self, life: object, reason: ProcessExit) -> None:
-        if life is self._life:
-            self._process = None
-            self._finish(f"the replay process exited unexpectedly ({reason})")
-
-    def _finish(self, fault: str | None) -> None:
-        self.status.state = ReplayState.DONE if fault is None else ReplayState.FAILED
-        self.status.error = fault
-        self._life = None
-        if fault is not None:
-            log.error("scene %s: a replay failed: %s", self._ledger.scene, fault)
-        process, self._process = self._process, None
-        if process is not None:
-            self._background.run(process.stop(1.0))
 
     async def end(self) -> None:
         """Stops the running replay, if any, at a client's request and keeps the points measured so far."""
-        if self._process is None:
+        if not self.busy:
             return
         await self.stop()
         self.status.state, self.status.error = ReplayState.FAILED, "the replay was stopped on request"
 
     async def stop(self) -> None:
         """Stops the running replay, if any, because the scene is stopping."""
-        self._life = None
-        process, self._process = self._process, None
-        if process is not None:
-            await process.stop(0)
+        if self._task is not None and not self._task.done():
+            self._task.cancel()
+            await asyncio.wait({self._task})

@@ -14,9 +14,9 @@ from scas4d_core.cameras import Camera
 from scas4d_core.errors import message_of
 from scas4d_core.first_frame.calibration.report import effective_rig
 from scas4d_core.rig_checks import RigError, check_start
-from server.background import Background
+from server.background import Background, shielded
 from server.hub import Hub, Publisher
-from server.ingest.acknowledge import Ingest, IngestRules, shield_and_wait
+from server.ingest.acknowledge import Ingest, IngestRules
 from server.ingest.open_frames import OpenFrames
 from server.messages import SceneSpec
 from server.problems import Problem, count_noun, rig_problem
@@ -138,7 +138,7 @@ class Scene:
         self.ingest = Ingest(self.log, self.rules, self.updates, self._publisher, can_begin=self._check_start)
         self.open_frames = OpenFrames(self.ingest, self._background)
         self.updates.on_queue_room(self.open_frames.close_due)
-        self.replays = Replays(self.spec, self.ledger, placement, self.repair_queue.report_damage, self._background)
+        self.replays = Replays(self.spec, self.ledger, placement, self.repair_queue.report_damage)
 
         if content.events:
             self._background.run(self.log.write(*content.events))
@@ -311,6 +311,7 @@ class Scene:
 
     # Changes.
 
+    @shielded
     async def set_budget(self, budget: Budget) -> None:
         """Sets the budget for all frames whose update has not started.
 
@@ -319,44 +320,34 @@ class Scene:
         Raises:
             Problem: 409 if the scene has failed; 507 if the disk is full.
         """
+        async with self.log.lock:
+            self.ingest.refuse_if_failed()
+            if self.ledger.budgets[-1][1] == budget:
+                return
+            with self.updates.paused():
+                await self.log.append(BudgetChanged(index=self.ledger.next_to_begin(), budget=budget))
 
-        async def journal_budget() -> None:
-            async with self.log.lock:
-                self.ingest.refuse_if_failed()
-                if self.ledger.budgets[-1][1] == budget:
-                    return
-                with self.updates.paused():
-                    await self.log.append(BudgetChanged(index=self.ledger.next_to_begin(), budget=budget))
-
-        await shield_and_wait(journal_budget())
-
+    @shielded
     async def pause(self, paused: bool) -> None:
         """Pauses updates after the current frame, or resumes them; the setting survives a service restart."""
-
-        async def journal_pause() -> None:
-            async with self.log.lock:
-                if self.ledger.paused != paused:
-                    await self.log.append(PauseChanged(paused=paused))
-
-        await shield_and_wait(journal_pause())
+        async with self.log.lock:
+            if self.ledger.paused != paused:
+                await self.log.append(PauseChanged(paused=paused))
         self.updates.begin()
 
+    @shielded
     async def edit(self, edit: SceneEdit) -> None:
         """Changes the name, archive flag or retention rules; the changes survive a service restart.
 
         Raises:
             Problem: 409 if the scene cannot be archived because frames are unfinished; 507 if the disk is full.
         """
-
-        async def change() -> None:
-            async with self.log.lock:
-                if edit.archived:
-                    self._refuse_unfinished()
-                event = SceneEdited(**dict(edit))
-                if event.merged_with(self.ledger.edited) != self.ledger.edited:
-                    await self.log.append(event)
-
-        await shield_and_wait(change())
+        async with self.log.lock:
+            if edit.archived:
+                self._refuse_unfinished()
+            event = SceneEdited(**dict(edit))
+            if event.merged_with(self.ledger.edited) != self.ledger.edited:
+                await self.log.append(event)
         kept = self.ledger.edited.rules(self.request.ingest)
         await self.updates.set_retention(kept)
 

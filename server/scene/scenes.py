@@ -11,14 +11,15 @@ import logging
 import secrets
 import shutil
 import time
-from collections.abc import AsyncIterator, Coroutine, Sequence
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager, suppress
 from datetime import UTC, datetime
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from client.wire import SceneCreate, SceneStatus
 from scas4d_core.errors import message_of
 from scas4d_core.settings import Settings
+from server.background import Background
 from server.hub import Hub
 from server.problems import Problem
 from server.processes.placement import Placement
@@ -62,7 +63,7 @@ class Scenes:
         self._beginning: dict[str, asyncio.Task[None]] = {}
         """Tasks of scenes whose reconstruction is being restarted, keyed by scene ID."""
         self._turns = Transitions()
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._background = Background(lambda error: log.error("a task of the service failed", exc_info=error))
 
     async def open(self) -> None:
         """Locks the data folder, finds its scenes and starts to recover them.
@@ -77,7 +78,7 @@ class Scenes:
             folder.mkdir(parents=True, exist_ok=True)
         self._lock = lock_data(self.server.data)
         await self.recovering.begin()
-        self._run(self._put_idle_to_sleep())
+        self._background.run(self._put_idle_to_sleep())
 
     # Awake and sleeping scenes.
 
@@ -283,7 +284,7 @@ class Scenes:
                 self.awake[scene.id].start()
             else:
                 del self.awake[scene.id]
-        self._run(asyncio.to_thread(self._data.remove_deleted))
+        self._background.run(asyncio.to_thread(self._data.remove_deleted))
 
     # Creation and deletion.
 
@@ -359,20 +360,13 @@ class Scenes:
         grave = await asyncio.to_thread(self._data.move_to_deleted, folder, folder.name)
         await asyncio.to_thread(shutil.rmtree, grave, ignore_errors=True)
 
-    def _run(self, coroutine: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        task = asyncio.create_task(coroutine)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-        return task
-
     async def stop(self) -> None:
         """Stops all scenes and their processes, and keeps their folders."""
         await self.recovering.stop()
         await asyncio.gather(*self._turns.values(), return_exceptions=True)
         if self._beginning:
             await asyncio.wait(self._beginning.values())
-        for task in tuple(self._tasks):
-            task.cancel()
+        self._background.cancel()
         await asyncio.gather(*(scene.stop() for scene in self.awake.values()))
         if self._lock is not None:
             self._lock.release()

@@ -33,28 +33,6 @@ Snapshot = Callable[[], Iterator[JournalEvent]]
 
 
 @dataclass(frozen=True)
-class JournalContent:
-    """Content of a journal.
-
-    Attributes:
-        events: all intact events, in order.
-        good: size of the journal in bytes, without a torn tail.
-        damage: one sentence per damaged region.
-    """
-
-    events: list[JournalEvent]
-    good: int
-    damage: list[str]
-
-
-def read_journal(path: Path) -> JournalContent:
-    """Reads a complete journal into memory; use `replay` for a large one."""
-    events: list[JournalEvent] = []
-    reading = replay(path, events.append)
-    return JournalContent(events, reading.good, reading.damage)
-
-
-@dataclass(frozen=True)
 class JournalReading:
     """Result of reading a journal.
 
@@ -98,7 +76,7 @@ def replay(path: Path, take: Callable[[JournalEvent], object]) -> JournalReading
             except ValidationError as error:
                 fault = event_fault(error)
                 broken = True
-                damage.append(f"{path.name}: invalid event of kind {record.kind}, frame {record.frame}: {fault}")
+                damage.append(f"{path.name}: invalid event of kind {record.kind}, frame {record.index}: {fault}")
                 continue
             begun = isinstance(event, SceneCreated) if begun is None else begun
             take(event)

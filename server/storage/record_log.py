@@ -31,6 +31,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
 from blake3 import blake3
@@ -54,28 +55,30 @@ class LogRecordKind(IntEnum):
     """Encoded image files of a frame, or of a single camera of a frame."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class LogRecord:
-    """Record as read from disk; `body` and `files` are views into the input.
+    """Record as read from disk.
 
-    `files` and `digests` (the BLAKE3 digest of each file) are set only for version 2.
+    Attributes:
+        kind, index: those of the header.
+        text: unparsed JSON head.
+        body, files: views into the input; `files` is set only for version 2.
+        digests: BLAKE3 digest of each file.
+        size: size of the record in bytes.
     """
 
     kind: int
     index: int
-    head: Any
-    body: memoryview
-    files: tuple[memoryview, ...] = ()
-    digests: tuple[bytes, ...] = ()
-
-
-class RecordHeader(NamedTuple):
-    """Header of a small record, with its unparsed JSON head and the total record size in bytes."""
-
-    kind: int
-    frame: int
     text: bytes
+    body: memoryview
+    files: tuple[memoryview, ...]
+    digests: tuple[bytes, ...]
     size: int
+
+    @cached_property
+    def head(self) -> Any:
+        """Parsed head."""
+        return json.loads(self.text)
 
 
 @dataclass(frozen=True)
@@ -118,39 +121,56 @@ def encode_record(kind: int, index: int, head: Any, body: bytes = b"") -> bytes:
     return start + body + checksum(start, body)
 
 
-def read_at(data: memoryview, at: int) -> tuple[LogRecord | Damage, int]:
+class _Opening(NamedTuple):
+    """Fields of a header that can be trusted, and the offsets at which the head and the record end."""
+
+    version: int
+    kind: int
+    frame: int
+    head_end: int
+    end: int
+
+
+def _opening(data: bytes | memoryview, at: int) -> _Opening | str:
+    """Returns the header and head at a byte offset, or the reason why they cannot be trusted."""
+    if len(data) - at < HEADER.size or data[at : at + len(MAGIC)] != MAGIC:
+        return "no record starts here"
+    _, version, kind, nought, head_length, index, body_length = HEADER.unpack_from(data, at)
+    head_end = at + PREFIX + head_length
+    if version not in (WHOLE, BY_FILE) or nought or head_length > MAX_HEAD or head_end > len(data):
+        return "the header has an unknown version, is damaged, or is truncated"
+    expected = CRC.unpack_from(data, at + HEADER.size)[0]
+    if zlib.crc32(data[at + PREFIX : head_end], zlib.crc32(data[at : at + HEADER.size])) != expected:
+        return "the header or head fails its checksum"
+    return _Opening(version, kind, index, head_end, head_end + body_length + CHECKSUM)
+
+
+def read_at(data: bytes | memoryview, at: int) -> tuple[LogRecord | Damage, int]:
     """Reads the record that starts at a byte offset.
 
     Returns:
         The record or the damage, and its end. If the header cannot be trusted, the damage ends at the next trusted
         header.
     """
-    header = data[at : at + HEADER.size]
-    if len(header) < HEADER.size or header[:4] != MAGIC:
-        return _skip(data, at, "no record starts here")
-    _, version, kind, nought, head_length, index, body_length = HEADER.unpack(header)
-    head_end = at + PREFIX + head_length
-    if version not in (WHOLE, BY_FILE) or nought or head_length > MAX_HEAD or head_end > len(data):
-        return _skip(data, at, "the header has an unknown version, is damaged, or is truncated")
-    head_bytes = data[at + PREFIX : head_end]
-    if CRC.unpack_from(data, at + HEADER.size)[0] != zlib.crc32(head_bytes, zlib.crc32(header)):
-        return _skip(data, at, "the header or head fails its checksum")
-    end = head_end + body_length + CHECKSUM
+    opening = _opening(data, at)
+    if isinstance(opening, str):
+        return _skip(data, at, opening)
+    version, kind, index, head_end, end = opening
     if end > len(data):
         damage, after = _skip(data, at, f"the record ends after {len(data) - at} of {end - at} bytes")
         return Damage(at, after, damage.reason, index, kind, damage.torn), after
-    start, body, found = data[at:head_end], data[head_end : end - CHECKSUM], data[end - CHECKSUM : end]
-    if version == WHOLE and checksum(start, body) != found:
-        return Damage(at, end, "the record fails its checksum", index, kind), end
-    try:
-        head = json.loads(bytes(head_bytes))
-        files = () if version == WHOLE else _files(head, body)
-    except (KeyError, TypeError, ValueError) as error:  # intact, but written by another program
-        return Damage(at, end, f"the head is not a valid record head ({error!r})", index, kind), end
+    text, body = bytes(data[at + PREFIX : head_end]), memoryview(data)[head_end : end - CHECKSUM]
+    files: tuple[memoryview, ...] = ()
+    if version == BY_FILE:
+        try:
+            files = _files(json.loads(text), body)
+        except (KeyError, TypeError, ValueError) as error:  # intact, but written by another program
+            return Damage(at, end, f"the head is not a valid record head ({error!r})", index, kind), end
     digests = tuple(blake3(file).digest() for file in files)
-    if version == BY_FILE and checksum(start, *digests) != found:
+    pieces = (data[at : end - CHECKSUM],) if version == WHOLE else (data[at:head_end], *digests)
+    if checksum(*pieces) != data[end - CHECKSUM : end]:
         return Damage(at, end, "the record fails its checksum", index, kind), end
-    return LogRecord(kind, index, head, body, files, digests), end
+    return LogRecord(kind, index, text, body, files, digests, end - at), end
 
 
 def _files(head: Any, body: memoryview) -> tuple[memoryview, ...]:
@@ -168,15 +188,6 @@ def _files(head: Any, body: memoryview) -> tuple[memoryview, ...]:
     return tuple(files)
 
 
-def read_records(data: bytes | memoryview) -> Iterator[LogRecord | Damage]:
-    """Yields every intact record of a log, and the damage between records, in order."""
-    view = memoryview(data)
-    at = 0
-    while at < len(view):
-        record, at = read_at(view, at)
-        yield record
-
-
 PIECE = 1 << 22
 """Number of bytes read at a time."""
 DECIDABLE_BYTES = 2 * (MAX_HEAD + PREFIX + CHECKSUM)
@@ -190,70 +201,36 @@ class Readable(Protocol):
         """Reads at most `size` bytes; returns no bytes at the end of the file."""
 
 
-def stream_records(file: Readable) -> Iterator[RecordHeader | Damage]:
-    """Yields the header of each record in a log of small records, and the damage between records.
+def stream_records(file: Readable) -> Iterator[LogRecord | Damage]:
+    """Yields each record in a log of small records (version 1), and the damage between records.
 
     The log need not fit in memory.
     """
     data, start, at, ended = b"", 0, 0, False
     while True:
-        head = _whole(data, at)
-        if head is not None:
-            yield head
-            at += head.size
-            continue
-        damage, after = _damage(data, at)
-        unsure = damage is None or len(data) - at < DECIDABLE_BYTES or after == len(data)
-        if unsure and not ended:
-            piece = file.read(PIECE)
-            ended = not piece
-            data, start, at = data[at:] + piece, start + at, 0
-            continue
-        if damage is None:
-            return
-        yield replace(damage, start=start + damage.start, end=start + damage.end)
+        record, after = read_at(data, at)
+        if isinstance(record, Damage):
+            unsure = len(data) - at < DECIDABLE_BYTES or after == len(data)
+            if unsure and not ended:
+                piece = file.read(PIECE)
+                ended = not piece
+                data, start, at = data[at:] + piece, start + at, 0
+                continue
+            if at == len(data):
+                return
+            record = replace(record, start=start + record.start, end=start + record.end)
+        elif record.files:
+            record = Damage(start + at, start + after, "the record version is not allowed here")
+        yield record
         at = after
 
 
-def _whole(data: bytes, at: int) -> RecordHeader | None:
-    """Returns the header of the record at a byte offset, or None if it is not an intact record of version 1."""
-    if len(data) - at < PREFIX:
-        return None
-    magic, version, kind, nought, head_length, index, body_length = HEADER.unpack_from(data, at)
-    head_end = at + PREFIX + head_length
-    end = head_end + body_length + CHECKSUM
-    if magic != MAGIC or version != WHOLE or nought or head_length > MAX_HEAD or end > len(data):
-        return None
-    text = data[at + PREFIX : head_end]
-    if CRC.unpack_from(data, at + HEADER.size)[0] != zlib.crc32(text, zlib.crc32(data[at : at + HEADER.size])):
-        return None
-    if blake3(data[at : end - CHECKSUM]).digest(CHECKSUM) != data[end - CHECKSUM : end]:
-        return None
-    return RecordHeader(kind, index, text, end - at)
-
-
-def _damage(data: bytes, at: int) -> tuple[Damage | None, int]:
-    """Returns the damage at a byte offset, or None at the end of the data, and the offset at which to continue."""
-    if at == len(data):
-        return None, at
-    record, after = read_at(memoryview(data), at)
-    return record if isinstance(record, Damage) else Damage(at, after, "the record version is not allowed here"), after
-
-
-def _skip(data: memoryview, at: int, reason: str) -> tuple[Damage, int]:
+def _skip(data: bytes | memoryview, at: int, reason: str) -> tuple[Damage, int]:
     """Returns the damage up to the next trusted header or the end of the data."""
-    text = data.obj if isinstance(data.obj, bytes) and len(data.obj) == len(data) else bytes(data)
+    whole = data if isinstance(data, bytes) else bytes(data)
     following = at
-    while (following := text.find(MAGIC, following + 1)) >= 0:
-        header = data[following : following + HEADER.size]
-        if len(header) < HEADER.size:
-            break
-        _, version, _, nought, head_length, _, _ = HEADER.unpack(header)
-        head_end = following + PREFIX + head_length
-        if version not in (WHOLE, BY_FILE) or nought or head_length > MAX_HEAD or head_end > len(data):
-            continue
-        head = data[following + PREFIX : head_end]
-        if CRC.unpack_from(data, following + HEADER.size)[0] == zlib.crc32(head, zlib.crc32(header)):
+    while (following := whole.find(MAGIC, following + 1)) >= 0:
+        if not isinstance(_opening(data, following), str):
             return Damage(at, following, reason), following
     return Damage(at, len(data), reason, torn=True), len(data)
 
@@ -271,14 +248,12 @@ def check_record(file: Readable) -> Iterator[int]:
         ValueError: the record is not intact.
     """
     header = file.read(PREFIX)
-    if len(header) < PREFIX or header[:4] != MAGIC:
-        raise ValueError("no record starts here")
-    _, version, _, nought, head_length, _, body_length = HEADER.unpack_from(header)
-    if version not in (WHOLE, BY_FILE) or nought or head_length > MAX_HEAD:
-        raise ValueError("the header has an unknown version, is damaged, or is truncated")
-    head = file.read(head_length)
-    if CRC.unpack_from(header, HEADER.size)[0] != zlib.crc32(head, zlib.crc32(header[: HEADER.size])):
-        raise ValueError("the header or head fails its checksum")
+    head_length = HEADER.unpack_from(header)[4] if len(header) == PREFIX else 0
+    head = file.read(min(head_length, MAX_HEAD))
+    opening = _opening(header + head, 0)
+    if isinstance(opening, str):
+        raise ValueError(opening)
+    version, body_length = opening.version, opening.end - opening.head_end - CHECKSUM
     try:
         sizes = [body_length] if version == WHOLE else [int(entry["size"]) for entry in json.loads(head)["files"]]
     except (KeyError, TypeError) as error:  # intact, but written by another program

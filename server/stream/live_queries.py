@@ -10,7 +10,6 @@ import asyncio
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Hashable
-from dataclasses import dataclass
 from typing import Any, Literal
 
 from client.wire import RenderRequest, TracksRequest
@@ -18,30 +17,13 @@ from client.wire.base import Model
 from client.wire.stream import BinaryHead, NoRequest, PartsSubscription, StreamProblem, pack
 from server.problems import SERVICE_FAULT, Problem
 from server.processes.queries import Answer, PartsQuery, Query, RenderQuery, StatesQuery, TracksQuery
-from server.processes.shared_queries import SharedQueries, fingerprint
+from server.processes.shared_queries import SharedQueries, SharedQuery, fingerprint
 from server.queries.render import render_query
 from server.queries.tracks import tracks_query
 from server.scene.scene import Scene
 from server.stream.outbox import Outbox
 
 log = logging.getLogger("scas4d.server")
-
-
-@dataclass(frozen=True)
-class LiveSharedQuery:
-    """Query of a live subscription at one point in time.
-
-    Attributes:
-        key: key that is equal for all subscribers that would get the same answer.
-        query: query to send to the readers.
-        head: head of the message with the answer; its media type and headers are filled in from the answer.
-        changes: number of changes that the answer covers.
-    """
-
-    key: Hashable
-    query: Query
-    head: BinaryHead
-    changes: int
 
 
 class LiveQuery(ABC):
@@ -108,12 +90,12 @@ class LiveQuery(ABC):
             self.on_sent(head)
         self._changes -= asked.changes
 
-    def _ask(self) -> LiveSharedQuery:
+    def _ask(self) -> SharedQuery:
         query = self.query()
         # Parts are computed from the whole history, so the same query may have a different answer after a commit.
         newest = self.scene.committed[-1] if self.needs_all_frames(query) else None
         head = self.head(query).model_copy(update={"id": self.id, "tag": self.tag})
-        return LiveSharedQuery((fingerprint(query), newest), query, head, self._changes)
+        return SharedQuery((fingerprint(query), newest), query, head, self._changes)
 
     def due(self) -> bool:
         """Returns True if a query should be issued now."""

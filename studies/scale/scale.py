@@ -13,11 +13,12 @@ from time import perf_counter
 import numpy as np
 
 from client.cli.evaluate import Report
-from client.cli.scores import Column, Row, digest, kept_row, markdown
+from client.cli.scores import Column, Row, digest, markdown
 from scas4d_core.captures import InitialPoints
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from studies.apart import in_a_process
+from studies.rows import kept_row
 from studies.wall import Size, known, rig, shown, wall
 
 SCENE = {"metres_per_unit": 1.0, "background": (0.0, 0.0, 0.0)}

@@ -71,7 +71,7 @@ def test_the_async_client_does_the_same(service):
 
 def test_both_clients_have_the_same_methods():
     def public(kind):
-        return {name: inspect.signature(value) for name, value in vars(kind).items() if not name.startswith("_")}
+        return {name: inspect.signature(getattr(kind, name)) for name in dir(kind) if not name.startswith("_")}
 
     sync, parallel = public(Client), public(AsyncClient)
     assert sync.keys() == parallel.keys()
@@ -79,8 +79,10 @@ def test_both_clients_have_the_same_methods():
     assert len(calls) > 15
     for name in calls:
         assert sync[name].parameters == parallel[name].parameters
-        assert vars(AsyncClient)[name].__doc__ == vars(Client)[name].__doc__ != None  # noqa: E711
-        assert inspect.iscoroutinefunction(vars(AsyncClient)[name])
+        assert getattr(AsyncClient, name).__doc__ == getattr(Client, name).__doc__ != None  # noqa: E711
+    coroutine = AsyncClient("http://x").live()
+    assert inspect.iscoroutine(coroutine)
+    coroutine.close()
 
 
 def test_methods_say_what_they_take():

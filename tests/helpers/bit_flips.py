@@ -21,10 +21,10 @@ from PIL import Image
 from scas4d_core.storage.history import NEWEST_KEPT
 from scas4d_core.storage.npz import read_npz
 from server.storage.frame_store import FrameDamage, read_pictures
-from server.storage.journal import read_journal
 from server.storage.layout import DataFolder
 from studies.running.process import Service, StudyError
 from studies.running.study import AGAIN_S, Study, digests, running
+from tests.helpers.journals import read_journal
 
 KINDS = ("state", "checkpoint", "fixed", "journal", "frame")
 BEFORE = 6

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from client.importers.calibration import Calibration, calibration_of_cameras
-from client.importers.formats.opencv_camera import opencv_camera, picture_size
+from client.importers.formats.opencv_camera import camera_of_table
 from scas4d_core.captures import CaptureError
 
 INTRINSICS_FOLDER = re.compile(r"int_(.+)_img")
@@ -49,16 +49,5 @@ def read_anipose(path: Path, document: Mapping[str, Any]) -> Calibration:
         if table.get("rotation") is None and table.get("translation") is None:
             left_out.append(inner[1] if inner else str(name))
             continue
-        cameras.append(
-            opencv_camera(
-                where,
-                inner[1] if inner else str(name),
-                matrix=table.get("matrix"),
-                distortions=table.get("distortions"),
-                rotation=table.get("rotation"),
-                translation=table.get("translation"),
-                size=picture_size(where, table.get("size")),
-                fisheye=table.get("fisheye") is True,
-            )
-        )
+        cameras.append(camera_of_table(where, inner[1] if inner else str(name), table))
     return calibration_of_cameras(path, cameras, left_out, f"{path.name}: skipped cameras that have no pose")

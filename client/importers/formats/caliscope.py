@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from client.importers.calibration import Calibration, calibration_of_cameras
-from client.importers.formats.opencv_camera import opencv_camera, picture_size
+from client.importers.formats.opencv_camera import camera_of_table
 from scas4d_core.captures import CaptureError
 
 
@@ -39,18 +39,7 @@ def read_caliscope(path: Path, document: Mapping[str, Any]) -> Calibration:
         if table.get("ignore") is True or not _calibrated(table):
             left_out.append(name)
             continue
-        cameras.append(
-            opencv_camera(
-                where,
-                name,
-                matrix=table["matrix"],
-                distortions=table.get("distortions"),
-                rotation=table["rotation"],
-                translation=table["translation"],
-                size=picture_size(where, table.get("size")),
-                fisheye=table.get("fisheye") is True,
-            )
-        )
+        cameras.append(camera_of_table(where, name, table))
     why = f"{path.name}: skipped cameras that are ignored or have no pose"
     return calibration_of_cameras(path, cameras, left_out, why)
 

@@ -8,7 +8,7 @@ and a translation: `X_cam = R X_world + t`. The camera's axes are x right, y dow
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -82,6 +82,24 @@ def opencv_camera(
     shift = HALF - first_pixel
     parameters = {"fx": k[0, 0], "fy": k[1, 1], "cx": k[0, 2] + shift, "cy": k[1, 2] + shift, **coefficients}
     return lens_camera(name, model, parameters, pose, size, source=where)
+
+
+def camera_of_table(where: str, name: str, table: Mapping[str, Any]) -> LensCamera:
+    """Returns a camera from a table with the fields of aniposelib, which caliscope also writes.
+
+    Raises:
+        CaptureError: as for `opencv_camera`.
+    """
+    return opencv_camera(
+        where,
+        name,
+        matrix=table.get("matrix"),
+        distortions=table.get("distortions"),
+        rotation=table.get("rotation"),
+        translation=table.get("translation"),
+        size=picture_size(where, table.get("size")),
+        fisheye=table.get("fisheye") is True,
+    )
 
 
 def _distortion(where: str, given: Any, fisheye: bool) -> tuple[str, dict[str, float]]:

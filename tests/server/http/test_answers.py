@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import shutil
 from collections import namedtuple
 
 import httpx
@@ -12,7 +13,6 @@ from waiting import HANG_S
 
 from client.sdk import Client
 from server.http.immutable import content_disposition
-from server.routes import health
 
 NAME = next(iter(pictures()))
 
@@ -163,7 +163,7 @@ def test_a_full_disk_ends_ingest_and_not_the_service(tmp_path, monkeypatch):
             assert sdk.ingest_ready().ingest_ready is True
             assert sdk.ready().ingest_ready is True
             usage = namedtuple("usage", "total used free")
-            monkeypatch.setattr(health.shutil, "disk_usage", lambda path: usage(10**9, 10**9 - 5_000_000, 5_000_000))
+            monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(10**9, 10**9 - 5_000_000, 5_000_000))
             document = problem(http.get("/health/ingest"), 503)
             assert "5 MB free" in document["detail"]
             assert "retry-after" in http.get("/health/ingest").headers

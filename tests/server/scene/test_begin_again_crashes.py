@@ -15,10 +15,11 @@ from client.wire import ReconstructionRequest
 from scas4d_core.storage.history import History
 from server.scene import new_reconstruction, stored_scene
 from server.storage.events import FrameAccepted, FrameFailed, PicturesDeleted, ReconstructionBegun, StatesDeleted
-from server.storage.journal import Journal, encode_events, read_journal
+from server.storage.journal import Journal, encode_events
 from server.storage.layout import DataFolder
 from server.storage.ledger import Ledger
 from server.storage.recovery import NO_STATE, recover
+from tests.helpers.journals import read_journal
 
 CHANGED = {"static": {"iterations": fakes.PICKED}}
 FRAMES = 3

@@ -28,9 +28,10 @@ from server.storage.events import (
     StatesDeleted,
     WorkerDied,
 )
-from server.storage.journal import Journal, read_journal, replay
+from server.storage.journal import Journal, replay
 from server.storage.ledger import Ledger
 from server.storage.snapshot import events_of
+from tests.helpers.journals import read_journal
 
 MADE = SceneCreated(definition={"id": "abc"})
 
