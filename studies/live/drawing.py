@@ -24,6 +24,7 @@ from scas4d_core.compact import CompactReader, CompactWriter
 from scas4d_core.engines.limits import rig_limits
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.view import ViewRenderer
+from studies.live.main_thread import main_thread_clock
 from studies.machine import browser_path, in_words, machine
 
 WIDTH, HEIGHT = 640, 360
@@ -210,18 +211,10 @@ def main_thread_ms(source: Path, work: Path, seconds: float) -> float:
         page.wait_for_function("() => document.body.dataset.pictures > 0")
         page.keyboard.press(" ")
         page.wait_for_timeout(1e3 * WARM_S)
-        devtools = page.context.new_cdp_session(page)
-        devtools.send("Performance.enable", {"timeDomain": "threadTicks"})  # time that the thread runs
-
-        def counts() -> tuple[float, int]:
-            metrics = devtools.send("Performance.getMetrics")["metrics"]
-            busy = next(one["value"] for one in metrics if one["name"] == "TaskDuration")
-            return 1e3 * busy, int(page.evaluate("document.body.dataset.pictures"))
-
-        busy, pictures = counts()
+        clock, pictures = main_thread_clock(page), "Number(document.body.dataset.pictures)"
+        busy, drawn = clock(), float(page.evaluate(pictures))
         page.wait_for_timeout(1e3 * seconds)
-        later, more = counts()
-    return (later - busy) / max(1, more - pictures)
+        return (clock() - busy) / max(1.0, float(page.evaluate(pictures)) - drawn)
 
 
 def agreement(source: Path, views: int) -> list[tuple[float, float]]:

@@ -23,6 +23,7 @@ from client.wire import FrameState
 from client.wire.stream import unpack
 from scas4d_core.cameras import Rig
 from scas4d_core.compact import CompactReader
+from studies.live.main_thread import main_thread_clock
 from studies.machine import browser_path, in_words, machine
 from studies.running.process import Service, StudyError
 
@@ -38,6 +39,8 @@ WATCH = """() => {
   const [view, latency] = ['view', 'latency'].map((id) => document.getElementById(id));
   const whole = () => { window.whole[view.dataset.frame] ??= now(); };
   new MutationObserver(whole).observe(view, { attributes: true, attributeFilter: ['data-frame'] });
+  window.pictures = 0;
+  new MutationObserver(() => window.pictures++).observe(view, { attributes: true, attributeFilter: ['data-size'] });
   if (!latency) return;
   const first = () => {
     const [, frame, sent, drawn] = latency.textContent.match(/^Frame (\\d+).* sent (\\d+), drawn (\\d+)$/) ?? [];
@@ -57,6 +60,7 @@ class ViewerResult:
         whole_ms: milliseconds from each commit to the first picture that shows the frame itself, ascending.
         stages_ms: [frames, 2] milliseconds from commit to sending, and from arrival to the first picture.
         frames: number of frames that were committed.
+        main_thread_ms: milliseconds of the page's main thread per picture.
     """
 
     size: float
@@ -64,6 +68,7 @@ class ViewerResult:
     whole_ms: list[float]
     stages_ms: list[tuple[float, float]]
     frames: int
+    main_thread_ms: float
 
 
 def measure(service: Service, folder: Path, frames: int, fps: float) -> ViewerResult:
@@ -108,15 +113,17 @@ def measure(service: Service, folder: Path, frames: int, fps: float) -> ViewerRe
         page.wait_for_function("() => document.getElementById('view').dataset.drawn === 'here'")
         page.evaluate(WATCH)
         received.clear()
-        began = time.monotonic()
+        clock = main_thread_clock(page)
+        busy, drawn, began = clock(), page.evaluate("window.pictures"), time.monotonic()
         for index in range(1, frames + 1):
             page.wait_for_timeout(max(0.0, 1e3 * (began + index / fps - time.monotonic())))
             service.put(scene, index, images, {})
         page.wait_for_function(f"() => document.getElementById('view').dataset.frame === '{frames}'")
-        first, whole, stages = page.evaluate("[window.first, window.whole, window.stages]")
+        first, whole, stages, pictures = page.evaluate("[window.first, window.whole, window.stages, window.pictures]")
+        spent = (clock() - busy) / max(1, pictures - drawn)
         browser.close()
     service.http.delete(f"/v1/scenes/{scene}")
-    return ViewerResult(sum(received) / frames, _delays(first, commits), _delays(whole, commits), stages, frames)
+    return ViewerResult(sum(received) / frames, _delays(first, commits), _delays(whole, commits), stages, frames, spent)
 
 
 def _black(width: int, height: int) -> bytes:
@@ -172,6 +179,7 @@ def report(result: ViewerResult, fps: float) -> str:
             f"| bytes received per frame | {result.size / 1e3:.1f} kB |",
             f"| commit to the first picture with the frame's motion, p50 / p95 | {quantiles(result.first_ms)} |",
             f"| of which commit to sending, arrival to picture, p50 | {stages} |",
+            f"| main thread per picture | {result.main_thread_ms:.1f} ms |",
             f"| commit to the first picture of the frame itself, p50 / p95 | {quantiles(result.whole_ms)} |",
         ]
     )

@@ -25,7 +25,7 @@ def test_recorded_states_are_committed_back_and_forth(tmp_path, monkeypatch):
 
 
 def test_the_report_names_bytes_and_times():
-    text = report(ViewerResult(70_000.0, [40.0, 60.0, 80.0], [200.0], [(20.0, 40.0)], 3), 5.0)
+    text = report(ViewerResult(70_000.0, [40.0, 60.0, 80.0], [200.0], [(20.0, 40.0)], 3, 4.5), 5.0)
     assert "| 70.0 kB |" in text
     assert "60 / 78 ms (3 frames)" in text
     assert "20 ms / 40 ms" in text
