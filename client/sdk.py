@@ -51,9 +51,9 @@ def _sends(build: Callable[P, Call[T]]) -> _Method[P, T]:
         return client.send(build(*args, **kwargs))
 
     signature = inspect.signature(build)
-    client = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
+    own = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
     method.__signature__ = signature.replace(  # type: ignore[attr-defined]
-        parameters=[client, *signature.parameters.values()], return_annotation=inspect.Signature.empty
+        parameters=[own, *signature.parameters.values()], return_annotation=inspect.Signature.empty
     )
     return cast(_Method[P, T], method)
 
@@ -274,6 +274,8 @@ class Client(_ClientBase):
 
 class AsyncClient(_ClientBase):
     """Asynchronous client for the service at `url`, with the same arguments, methods and errors as `Client`.
+
+    Methods return coroutines. Invalid arguments raise an error when the method is called, before it is awaited.
 
     >>> async def committed():
     ...     async with AsyncClient(url) as client:

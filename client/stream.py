@@ -16,7 +16,6 @@
 If the connection is lost, the client reconnects and renews all subscriptions, so that a stream survives a restart of
 the service. Trajectories are then sent again from their first frame. Iteration ends when the scene is deleted.
 """
-# ruff: noqa: F401
 
 from __future__ import annotations
 
@@ -32,7 +31,7 @@ from websockets.sync.client import ClientConnection
 from websockets.sync.client import connect as connect_sync
 
 from client.retries import OUTAGE_S
-from client.subscriptions import (
+from client.subscriptions import (  # noqa: F401 (public names of this module)
     Event,
     PartsEvent,
     StatesEvent,
@@ -47,7 +46,7 @@ from client.subscriptions import (
     tracks,
     view,
 )
-from client.wire.stream import (
+from client.wire.stream import (  # noqa: F401 (public names of this module)
     SCENE_GONE,
     FrameMessage,
     SceneGone,

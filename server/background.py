@@ -1,4 +1,4 @@
-"""Tasks of a scene: background tasks, calls that a cancellation must not interrupt, and tasks that end together."""
+"""Background tasks, calls that run to completion, and tasks that end together."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 class Background:
-    """A scene's background tasks, held by strong references to prevent garbage collection.
+    """Background tasks of a scene or of the service, held by strong references to prevent garbage collection.
 
     Args:
         failed: callback for exceptions raised by tasks.
@@ -68,17 +68,17 @@ def shielded(function: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, Corou
 
 async def run_until_first(
     *coroutines: Coroutine[Any, Any, Any], seconds: float | None = None
-) -> tuple[asyncio.Task[Any], ...]:
-    """Runs coroutines until one of them ends or a time limit is over, and cancels the others.
+) -> tuple[asyncio.Task[Any] | None, ...]:
+    """Runs coroutines until one of them ends or the time limit expires, and cancels the others.
 
     Returns:
-        The tasks of the coroutines, in order, all of them ended.
+        For each coroutine, its task if it ended by itself, otherwise None.
     """
     tasks = tuple(asyncio.create_task(coroutine) for coroutine in coroutines)
     try:
-        await asyncio.wait(tasks, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
+        done, _ = await asyncio.wait(tasks, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
     finally:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-    return tasks
+    return tuple(task if task in done else None for task in tasks)

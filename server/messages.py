@@ -288,7 +288,7 @@ class ExportProgressed:
     size: int
 
 
-# The last message of both.
+# The last message of a replay or an export.
 
 
 @dataclass(frozen=True)

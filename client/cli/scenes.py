@@ -68,7 +68,7 @@ def rename(
 ) -> None:
     """Renames a scene."""
     with Client(url, token=token) as client:
-        _told(client.edit_scene(scene, name=name))
+        _print_status(client.edit_scene(scene, name=name))
 
 
 @app.command()
@@ -131,7 +131,7 @@ def keep(
     if minutes is not None:
         kept_frames = (kept_frames or Retention()).model_copy(update={"seconds": 60 * minutes})
     with Client(url, token=token) as client:
-        _told(client.edit_scene(scene, keep_frames=kept_frames, keep_states=kept_states, exact_states=exact))
+        _print_status(client.edit_scene(scene, keep_frames=kept_frames, keep_states=kept_states, exact_states=exact))
 
 
 @app.command()
@@ -182,10 +182,10 @@ def _rule(option: str, given: str | None) -> Retention | None:
 def _change(scenes: Sequence[str], url: str, token: str | None, call: Callable[[Client, str], SceneStatus]) -> None:
     with Client(url, token=token) as client:
         for scene in scenes:
-            _told(call(client, scene))
+            _print_status(call(client, scene))
 
 
-def _told(status: SceneStatus) -> None:
+def _print_status(status: SceneStatus) -> None:
     _say(*table([status]))
 
 

@@ -203,8 +203,8 @@ class Renderer(Protocol):
     def turn_normals(self, before: Gaussians, after: Gaussians, near: Neighbourhoods) -> Gaussians:
         """Returns a state whose normals rotated with their neighbourhoods since an earlier state.
 
-        Normals rotate with their neighbourhood rather than with their own Gaussian, because a normal belongs to a
-        surface, and positions do not accumulate the errors of earlier frames. On `gloss`, both variants produced the
+        Normals rotate with their neighbourhood rather than with their own Gaussian. A normal belongs to a surface, and
+        positions do not accumulate the errors of earlier frames. On `gloss`, both variants produced the
         same result.
 
         Args:

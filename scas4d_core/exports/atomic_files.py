@@ -71,7 +71,7 @@ class AtomicWriter:
 
     def discard(self) -> None:
         """Deletes the incomplete file."""
-        self._stack.__exit__(Exception, Exception("given up"), None)
+        self._stack.__exit__(Exception, Exception("discarded"), None)
 
 
 def check_writable(path: Path | str) -> None:

@@ -16,7 +16,7 @@ WITH_PARTS = ("usd", "s4d")
 
 @dataclass(frozen=True)
 class Format:
-    """One format.
+    """Name, suffixes and requirements of an export format.
 
     Attributes:
         name: name used to select the format.

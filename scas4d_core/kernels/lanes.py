@@ -25,8 +25,8 @@ COUNT = 16
 """Number of lanes in a ``Lanes`` value."""
 
 emitted: Any = intrinsic
-"""Decorator for functions that emit LLVM instructions into kernels, and whose types depend on those of the arguments.
-See ``instruction`` for all others."""
+"""Decorator for functions that emit LLVM instructions into kernels. Use it if the types depend on those of the
+arguments, and ``instruction`` otherwise."""
 ARRAY = "array"
 """Type of an argument of an ``instruction`` that is a C-contiguous float32 array of any shape."""
 
@@ -140,8 +140,8 @@ def _data(context: Any, builder: Any, array_type: Any, array: Any) -> Any:
 def instruction(result: Any, *arguments: Any) -> Any:
     """Returns a decorator for functions that emit LLVM instructions into kernels.
 
-    The decorated function receives LLVM's IR builder, followed by the LLVM value of each argument. Of an ``ARRAY``, the
-    value is a pointer to its first value.
+    The decorated function receives LLVM's IR builder, followed by the LLVM value of each argument. For an
+    ``ARRAY``, this value is a pointer to the first element.
 
     Args:
         result: Numba type of the result.

@@ -63,7 +63,7 @@ def openapi_document(app: FastAPI) -> dict[str, Any]:
         for schema in written.get("components", {}).get("schemas", {}).values():
             simplify_tuples(schema)
             for field in schema.get("properties", {}).values():
-                if "description" in field:  # wrapped like the docstring that it is
+                if "description" in field:  # descriptions are docstrings, which are wrapped at the line length
                     field["description"] = " ".join(field["description"].split())
         if token:
             schemes = written.setdefault("components", {}).setdefault("securitySchemes", {})

@@ -12,7 +12,7 @@ import secrets
 import time
 from collections.abc import Callable
 
-from itsdangerous import BadSignature, URLSafeSerializer
+from itsdangerous import BadData, URLSafeSerializer
 from starlette.types import Message, Scope, Send
 
 from server.http.permissions import ALL, Permission
@@ -54,7 +54,7 @@ class Tickets:
         now = self._clock()
         try:
             number, until, permission = self._serializer.loads(ticket.encode(errors="replace"))
-        except BadSignature:
+        except BadData:  # also a signed ticket of another version
             return None
         self._used = {used: kept for used, kept in self._used.items() if kept > now}
         if until <= now or number in self._used:

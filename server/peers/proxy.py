@@ -111,7 +111,7 @@ class ProxyMiddleware:
         answering, _ = await run_until_first(
             _forward_request(peers.client, request, owner, scene, send), body.hung_up()
         )
-        if not answering.cancelled() and answering.result() == NOT_FOUND:  # of the scene or of a resource in it
+        if answering is not None and answering.result() == NOT_FOUND:  # of the scene or of a resource in it
             await peers.check(owner, scene)
 
 

@@ -51,7 +51,7 @@ async def wait_for_job(
     Args:
         placement: placement that starts the process.
         entry, spec: entry point of the process and its argument.
-        on_message: callback for every other message of the process.
+        on_message: callback for every other message of the process, until the job has ended or was cancelled.
         name: name of the job in error messages.
 
     Returns:
@@ -66,7 +66,7 @@ async def wait_for_job(
     def receive(message: Any) -> None:
         if isinstance(message, JobEnded):
             end(message.fault)
-        else:
+        elif not ended.done():
             on_message(message)
 
     def gone(reason: ProcessExit) -> None:

@@ -24,7 +24,7 @@ from server.settings import ServerSettings
 def _of_app(name: str) -> Any:
     """Returns the dependency that reads an attribute of the application's state."""
 
-    def read(request: Request) -> Any:
+    async def read(request: Request) -> Any:  # not in a thread, because it does not block
         return getattr(request.app.state, name)
 
     return Depends(read)
@@ -94,8 +94,8 @@ async def ask(request: Request, scene: Scene, query: Query) -> Answer:
     Raises:
         Problem: see `Readers.ask`; 503 if the client has closed the connection.
     """
-    asking, leaving = await run_until_first(scene.readers.ask(query), _hung_up(request))
-    if asking.cancelled() and not leaving.cancelled():
+    asking, _ = await run_until_first(scene.readers.ask(query), _hung_up(request))
+    if asking is None:
         raise Problem(503, "the client closed the connection", remedy="send the request again")
     answer: Answer = asking.result()
     return answer

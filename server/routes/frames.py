@@ -38,9 +38,15 @@ BINARY = {"type": "string", "format": "binary"}
 
 
 def _request_body(frames: str, others: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Returns the description of a body of S4DF frames, or of another media type with the schema given for it."""
-    schemas = {**others, FRAME_MEDIA_TYPE: {**BINARY, "description": frames}}
-    return {"requestBody": {"required": True, "content": {kind: {"schema": schemas[kind]} for kind in schemas}}}
+    """Describes a request body in OpenAPI.
+
+    Args:
+        frames: description of the body in the format S4DF.
+        others: schemas of the other media types, by media type.
+    """
+    schemas = {FRAME_MEDIA_TYPE: {**BINARY, "description": frames}, **others}
+    content = {kind: {"schema": schema} for kind, schema in schemas.items()}
+    return {"requestBody": {"required": True, "content": content}}
 
 
 def _form(files: str, **fields: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:

@@ -63,7 +63,7 @@ async def _serve(websocket: WebSocket, subscriber: Subscriber, end: float | None
     await subscriber.greet()
     seconds = None if end is None else max(0.0, end - time.time())
     tasks = await run_until_first(_read(websocket, subscriber), _write(websocket, subscriber), seconds=seconds)
-    ended = [task for task in tasks if not task.cancelled()]
+    ended = [task for task in tasks if task is not None]
     if not ended:
         await websocket.close(1008, "the link has expired")
     for task in ended:

@@ -163,7 +163,7 @@ class Replays:
         try:
             fault = await wait_for_job(self._placement, replayer.main, spec, self._on_message, "replay")
         except Exception as error:
-            log.exception("scene %s: a replay failed", self._ledger.scene)
+            log.debug("scene %s: a replay failed", self._ledger.scene, exc_info=error)
             fault = f"internal error: {type(error).__name__}: {message_of(error)}"
         if fault is not None:
             log.error("scene %s: a replay failed: %s", self._ledger.scene, fault)

@@ -168,7 +168,7 @@ def read_pictures(folder: Path, name: str) -> StoredPictures:
         data = (folder / name).read_bytes()
     except OSError as error:
         raise FrameDamage(f"{name}: {error.strerror}") from None
-    record, end = read_at(memoryview(data), 0)
+    record, end = read_at(data, 0)
     if not isinstance(record, LogRecord) or record.kind != LogRecordKind.PICTURES or end != len(data):
         raise FrameDamage(f"{name}: {'not a single image record' if isinstance(record, LogRecord) else record.reason}")
     images: dict[str, memoryview] = {}

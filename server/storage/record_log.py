@@ -55,12 +55,12 @@ class LogRecordKind(IntEnum):
     """Encoded image files of a frame, or of a single camera of a frame."""
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class LogRecord:
     """Record as read from disk.
 
     Attributes:
-        kind, index: those of the header.
+        kind, index: kind and frame index from the header.
         text: unparsed JSON head.
         body, files: views into the input; `files` is set only for version 2.
         digests: BLAKE3 digest of each file.
@@ -131,7 +131,7 @@ class _Opening(NamedTuple):
     end: int
 
 
-def _opening(data: bytes | memoryview, at: int) -> _Opening | str:
+def _opening(data: bytes, at: int) -> _Opening | str:
     """Returns the header and head at a byte offset, or the reason why they cannot be trusted."""
     if len(data) - at < HEADER.size or data[at : at + len(MAGIC)] != MAGIC:
         return "no record starts here"
@@ -145,7 +145,7 @@ def _opening(data: bytes | memoryview, at: int) -> _Opening | str:
     return _Opening(version, kind, index, head_end, head_end + body_length + CHECKSUM)
 
 
-def read_at(data: bytes | memoryview, at: int) -> tuple[LogRecord | Damage, int]:
+def read_at(data: bytes, at: int) -> tuple[LogRecord | Damage, int]:
     """Reads the record that starts at a byte offset.
 
     Returns:
@@ -225,11 +225,10 @@ def stream_records(file: Readable) -> Iterator[LogRecord | Damage]:
         at = after
 
 
-def _skip(data: bytes | memoryview, at: int, reason: str) -> tuple[Damage, int]:
+def _skip(data: bytes, at: int, reason: str) -> tuple[Damage, int]:
     """Returns the damage up to the next trusted header or the end of the data."""
-    whole = data if isinstance(data, bytes) else bytes(data)
     following = at
-    while (following := whole.find(MAGIC, following + 1)) >= 0:
+    while (following := data.find(MAGIC, following + 1)) >= 0:
         if not isinstance(_opening(data, following), str):
             return Damage(at, following, reason), following
     return Damage(at, len(data), reason, torn=True), len(data)

@@ -32,7 +32,7 @@ from studies.exports.gltf import open_gltf
 Float = NDArray[np.float64]
 Y_UP = np.array([1.0, -1.0, -1.0])
 IN_METRES = {"spz", "spz4", "glb", "glb-parts"}
-"""Formats in metres; all others are in the user's unit."""
+"""Formats read by this study whose positions are in metres."""
 SPLAT = "KHR_gaussian_splatting"
 TITLE, GAP = 24, 12
 """Height of a title and gap between images on a contact sheet, in pixels."""

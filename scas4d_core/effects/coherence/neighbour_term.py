@@ -1,4 +1,4 @@
-"""Effects that are terms between neighbours (Dynamic3DGaussians).
+"""Effects that add a loss term between neighbours (Dynamic3DGaussians).
 
 Kernel: ``kernels.neighbour_terms``; references: ``engines.torch.losses``.
 """

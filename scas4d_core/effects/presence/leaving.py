@@ -44,18 +44,19 @@ def outside_all_views(state: Gaussians, rig: Rig) -> NDArray[np.bool_]:
         rig: cameras in the internal world, including excluded cameras, which may be accepted again.
     """
     rows = np.flatnonzero(state.moving)
-    longest = np.fmax.reduce(np.square(state.factors).sum(axis=1), axis=1, initial=0)
-    extents = WIDTHS * np.sqrt(longest).astype(np.float64)
-    for camera in rig.cameras:  # most Gaussians are inside the first image
-        pose, extent = camera.world_to_camera, extents[rows]
-        x, y, z = state.means[rows].astype(np.float64).T
-        across, down, depth = (pose[k, 0] * x + pose[k, 1] * y + pose[k, 2] * z + pose[k, 3] for k in range(3))
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+    # Gaussians that are held back may not be finite, and depths may be 0.
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        longest = np.fmax.reduce(np.square(state.factors[rows]).sum(axis=1), axis=1, initial=0)
+        extent = WIDTHS * np.sqrt(longest).astype(np.float64)
+        for camera in rig.cameras:  # most Gaussians are inside the first image
+            pose = camera.world_to_camera
+            x, y, z = state.means[rows].astype(np.float64).T
+            across, down, depth = (pose[k, 0] * x + pose[k, 1] * y + pose[k, 2] * z + pose[k, 3] for k in range(3))
             u, v = camera.fx * across / depth + camera.cx, camera.fy * down / depth + camera.cy
             border = camera.fx * extent / depth
-        inside = (depth > 0) & (u > -border) & (u < camera.width + border)
-        inside &= (v > -border) & (v < camera.height + border)
-        rows = rows[~inside]
+            inside = (depth > 0) & (u > -border) & (u < camera.width + border)
+            inside &= (v > -border) & (v < camera.height + border)
+            rows, extent = rows[~inside], extent[~inside]
     outside = np.zeros(len(state), np.bool_)
     outside[rows] = True
     return outside

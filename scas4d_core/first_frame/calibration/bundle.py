@@ -37,6 +37,8 @@ focal length are weighted by the image displacement that they cause. After the f
 scale is the median displacement of the rig if the displacement is larger."""
 MIN_ANGLE_DEG = 1.0
 """Minimum triangulation angle in degrees. Rays at smaller angles hardly constrain depth."""
+NEAREST = 1e-6
+"""Minimum ratio of a point's depths in two cameras. Numerical derivatives are not finite at a camera's centre."""
 MAX_STEPS = 40
 """Maximum number of evaluated steps per round."""
 MIN_RELATIVE_GAIN = 1e-5
@@ -80,9 +82,11 @@ def bundle_adjust(
         if len(points):
             depths = _median_depths(current, seen, points)
             pixels = _pixels_per_unit(current, depths)[:, : moves.shape[1]]
-            moves = _adjust(cameras, moves, seen, points, pixels / trust, float(np.median(depths)))
+            with_points = np.unique(seen.camera)
+            length = float(np.median(depths[with_points]))
+            moves = _adjust(cameras, moves, seen, points, pixels / trust, length)
             current = [_moved(camera, move) for camera, move in zip(cameras, moves, strict=True)]
-            distances = np.linalg.norm(moves * pixels, axis=1)[np.unique(seen.camera)]
+            distances = np.linalg.norm(moves * pixels, axis=1)[with_points]
             trust = max(MIN_PRIOR_SCALE, float(np.median(distances)))
     return current
 
@@ -111,7 +115,8 @@ def _triangulate_tracks(
         if answer is None:
             continue
         point, right = answer
-        if right.sum() >= 2:
+        depths = np.array([cameras[k].to_camera(point[None])[0, 2] for k in who[right]])
+        if right.sum() >= 2 and depths.min() > NEAREST * depths.max():
             points.append(point)
             owner.append(who[right])
             pixels.append(uv[right])

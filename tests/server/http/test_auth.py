@@ -10,6 +10,7 @@ import socket
 import httpx
 import pytest
 import websockets
+from itsdangerous import Signer
 from running import Running, fake_settings, make_rig, problem
 from waiting import HANG_S
 
@@ -19,7 +20,7 @@ from server.http import tickets as tickets_module
 from server.http.authentication import AuthMiddleware
 from server.http.origin import check_origin
 from server.http.permissions import ALL, Permission
-from server.http.sharing import Sharing
+from server.http.sharing import HMAC_SHA256, Sharing
 from server.http.tickets import SUBPROTOCOL, Tickets
 from server.settings import ServerSettings, SettingsError
 
@@ -361,6 +362,8 @@ def test_a_ticket_is_known_by_every_service_of_that_token_and_by_no_other(permis
     changed = Tickets(TOKEN + "x").issue(permission._replace(write=not permission.write)).rpartition(".")[0]
     for other in (f"{changed}.{signature}", "A" + ticket, ticket[:-1], "", ".", "a.b.c.d.e.f", "\udcff.ü"):
         assert Tickets(TOKEN).redeem(other) is None
+    of_another_version = Signer(TOKEN, "scas4d tickets", **HMAC_SHA256).sign("number.w.*.0.2000000000").decode()
+    assert Tickets(TOKEN).redeem(of_another_version) is None
     assert Sharing(TOKEN).read(ticket) is None  # what opens a WebSocket is no token for reading
     assert Tickets(TOKEN).redeem(Sharing(TOKEN).issue("ab12", 2_000_000_000)) is None
 

@@ -25,6 +25,16 @@ def test_gaussians_behind_or_beside_all_cameras_are_outside() -> None:
     assert outside_all_views(state, Rig((camera,))).tolist() == [False, True, True, False, False]
 
 
+def test_values_that_are_not_finite_affect_no_other_gaussian() -> None:
+    camera = Camera("a", [[100, 0, 50], [0, 100, 50], [0, 0, 1]], np.eye(4), 100, 100)
+    state = Gaussians.of_points([[np.nan, 0, 2], [np.inf, 0, 2], [0, 0, 2], [0, 0, 2], [2, 0, 2]], radius=0.02)
+    factors = state.factors.copy()
+    factors[2], factors[3] = np.nan, 1e30
+    state = state.replace(factors=factors, foreground=np.ones(5, np.float32))
+    found = outside_all_views(state, Rig((camera,)))
+    assert found[3:].tolist() == [False, True]
+
+
 def test_it_is_retired_after_some_frames() -> None:
     state, carried = scene(known(), visitor(AWAY)), {}
     for index in range(FRAMES):

@@ -1,4 +1,4 @@
-"""Bundle adjustment: faults are found back, what is right stays, the prior is in pixels."""
+"""Bundle adjustment corrects faults and keeps correct cameras; the prior is in pixels."""
 
 from __future__ import annotations
 
