@@ -38,7 +38,7 @@ ROOT = Path(__file__).parents[1]
 RECORDS = ROOT / "docs" / "figures.json"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 TABLE = re.compile(r"^<!-- table: (?P<name>[\w-]+) -->\n(?P<table>(?:\|.*\n)*)", re.MULTILINE)
-FIGURE = re.compile(r"(?P<text>\d{4}-\d\d-\d\d|\d[\d,]*(?:\.\d+)?)<!-- (?P<name>[\w.-]+) -->")
+FIGURE = re.compile(r"(?P<text>\d{4}-\d\d-\d\d|(?:(?<![\w.])[-−+])?\d[\d,]*(?:\.\d+)?)<!-- (?P<name>[\w.-]+) -->")
 ROW_VALUES = ("gaussians", "psnr_first", "psnr", "psnr_worst", "track_3d_median", "mte_2d", "seconds_update")
 UNIT = r"(?:(?:dB|ms|s|seconds?|minutes?|hours?|kB|MB|GB|frames/s|frames per second|times|pixels)\b|%)"
 NUMERAL = "half a|one|two|three|four|five|six|seven|eight|nine|ten|twenty|thirty|forty|fifty|sixty"
@@ -72,15 +72,27 @@ def value_of(records: Records, name: str) -> Any:
 
 
 def format_like(text: str, value: Any) -> str:
-    """Formats a value with the decimals and separators of the text that it replaces.
+    """Formats a value with the decimals of the text that it replaces, and commas from 1,000 on.
 
     >>> format_like("1.0", 35.68), format_like("1,000", 21821), format_like("2026-01-01", "2026-12-01")
     ('35.7', '21,821', '2026-12-01')
+    >>> format_like("+1.0", 2.5), format_like("+1.0", -2.5)
+    ('+2.5', '−2.5')
     """
     if isinstance(value, str):
         return value
     decimals = len(text.partition(".")[2])
-    return f"{value:{',' if abs(value) >= 1000 else ''}.{decimals}f}"
+    sign = "−" if value < 0 else "+" if text[0] == "+" else ""
+    return f"{sign}{abs(value):{',' if abs(value) >= 1000 else ''}.{decimals}f}"
+
+
+def parse(text: str) -> float:
+    """Returns the value of a number in a page.
+
+    >>> parse("1,200.5"), parse("−3"), parse("+3")
+    (1200.5, -3.0, 3.0)
+    """
+    return float(text.replace(",", "").replace("−", "-"))
 
 
 def with_figures(page: str, records: Records) -> str:
@@ -100,12 +112,16 @@ def with_figures(page: str, records: Records) -> str:
     return TABLE.sub(replace_table, FIGURE.sub(replace, page))
 
 
-def without_figures(page: str) -> str:
-    """Returns a page without recorded figures, code and tables of settings."""
-    text = TABLE.sub("", FIGURE.sub("", page))
+def without_code(page: str) -> str:
+    """Returns a page without code and tables of settings."""
     return re.sub(
-        r"^```.*?^```|`[^`]*`|<!-- settings: .*?<!-- end of settings", "", text, flags=re.DOTALL | re.MULTILINE
+        r"^```.*?^```|`[^`]*`|<!-- settings: .*?<!-- end of settings", "", page, flags=re.DOTALL | re.MULTILINE
     )
+
+
+def without_figures(page: str) -> str:
+    """Returns a page without recorded figures and tables."""
+    return TABLE.sub("", FIGURE.sub("", page))
 
 
 def unrecorded(page: str) -> list[str]:
@@ -114,7 +130,7 @@ def unrecorded(page: str) -> list[str]:
     >>> unrecorded("35.7<!-- robot.psnr --> dB and `10 s`, but 3 s and two minutes")
     ['3 s', 'two minutes']
     """
-    text = without_figures(page)
+    text = without_figures(without_code(page))
     return NUMBER_WITH_UNIT.findall(text) + NUMERAL_WITH_UNIT.findall(text)
 
 
@@ -127,7 +143,7 @@ def unrecorded_in_sections(page: str) -> list[str]:
     ['3 s', '2026-01-01']
     """
     found = []
-    for section in re.split(r"^(?=#+ )", page, flags=re.MULTILINE):
+    for section in re.split(r"^(?=#+ )", without_code(page), flags=re.MULTILINE):
         text = without_figures(section)
         found += NUMBER_WITH_UNIT.findall(text) if FIGURE.search(section) or TABLE.search(section) else []
         found += DATE.findall(text)
@@ -202,7 +218,7 @@ def record_page(page: str, command: str) -> Records:
             record |= date
         else:
             is_date = DATE.fullmatch(match["text"])
-            record.setdefault("values", {})[key] = match["text"] if is_date else float(match["text"].replace(",", ""))
+            record.setdefault("values", {})[key] = match["text"] if is_date else parse(match["text"])
     return records
 
 
@@ -224,27 +240,28 @@ def changed_records(page: str, measured: Records, known: Records) -> Records:
 
 def main(arguments: list[str]) -> int:
     """Runs the command line; see the module's docstring."""
+    records = load()
     if arguments[:1] == ["rows"]:
-        save(load() | dict(record_rows([Path(path) for path in arguments[1:]])))
+        records |= dict(record_rows([Path(path) for path in arguments[1:]]))
     elif arguments[:1] == ["time"] and len(arguments) > 2:
         run = lambda command: subprocess.run(command, cwd=ROOT, check=True)  # noqa: E731
-        save(load() | {arguments[1]: record_time(arguments[2:], run)})
+        records[arguments[1]] = record_time(arguments[2:], run)
     elif arguments[:1] == ["values"] and len(arguments) > 3:
         pairs = [text.partition("=") for text in arguments[3:]]
-        save(load() | {arguments[1]: new_record(arguments[2], values={key: float(value) for key, _, value in pairs})})
+        records[arguments[1]] = new_record(arguments[2], values={key: float(value) for key, _, value in pairs})
     elif arguments[:1] == ["table"] and len(arguments) == 5:
         table = tables_of(Path(arguments[3]).read_text())[int(arguments[4]) - 1]
-        save(load() | {arguments[1]: new_record(arguments[2], table=table)})
+        records[arguments[1]] = new_record(arguments[2], table=table)
     elif arguments[:1] == ["page"] and len(arguments) == 3:
         written = Path(arguments[1]).read_text()
-        save(load() | changed_records(written, record_page(written, arguments[2]), load()))
+        records |= changed_records(written, record_page(written, arguments[2]), records)
     elif arguments not in ([], ["--check"]):
         print(__doc__, file=sys.stderr)
         return 2
-    records = load()
-    pages = {page: with_figures(page.read_text(), records) for page in PAGES}
+    pages = {page: with_figures(page.read_text(), records) for page in PAGES}  # fails before anything is written
     changed = [page for page, text in pages.items() if text != page.read_text()]
     if arguments != ["--check"]:
+        save(records)
         for page in changed:
             page.write_text(pages[page])
         return 0

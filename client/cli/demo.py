@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -10,7 +11,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -37,11 +38,16 @@ def running_service(data: Path, log: Path, port: int = 8000) -> Iterator[str]:
         RuntimeError: the service exited or could not become ready; the message contains the reason and the log path.
         ModuleNotFoundError: the service is not installed.
     """
+
+    def stop(*_: object) -> NoReturn:
+        raise SystemExit(128 + signal.SIGTERM)  # so that the service is stopped, too
+
     need_server()
     port = port if _free(port) else _free(0)
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("w") as file:
         command = [sys.executable, "-m", "client.cli.main", "serve", "--port", str(port), "--data", str(data)]
+        before = signal.signal(signal.SIGTERM, stop)
         process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
     try:
         url = f"http://127.0.0.1:{port}"
@@ -56,6 +62,7 @@ def running_service(data: Path, log: Path, port: int = 8000) -> Iterator[str]:
             bars(PREPARING, total, total)
         yield url
     finally:
+        signal.signal(signal.SIGTERM, before)
         process.terminate()
         try:
             process.wait(20)

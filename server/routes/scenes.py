@@ -183,7 +183,7 @@ async def put(
     exports: AllExports,
     request: ReconstructionRequest | None = None,
 ) -> SceneStatus:
-    """Restarts the reconstruction of a scene, e.g. after a first frame that failed or has poor quality.
+    """Restarts the reconstruction of a scene, for example after a first frame that failed or has poor quality.
 
     The new reconstruction replaces the previous one; its committed states and exports are deleted. All frames
     whose images are still stored are reconstructed again in order. The restart is on disk when the response is sent.

@@ -247,7 +247,9 @@ class Scene:
                 f"no committed frames from {start} to {end}",
                 field=field,
                 value=start,
-                remedy=f"use a range within {self.committed[0]} to {self.committed[-1]}",
+                remedy=f"use a range within {self.committed[0]} to {self.committed[-1]}"
+                if start <= end
+                else "exchange the first and the last frame",
             )
         return frames
 

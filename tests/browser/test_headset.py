@@ -128,6 +128,21 @@ def test_each_eye_sees_what_the_cpu_rasterizer_renders(page, headset, player, fi
     assert page.faults == []
 
 
+def test_frames_that_the_page_has_dropped_are_sent_again(page, headset, player, file):
+    worn(page, player)
+    with CompactReader(file) as reader:
+        indices, times = reader.frames, reader.times
+    for place in (1.5, 2.5, 0.5, 3.0):
+        low = int(place)
+        seconds = times[low] + (place - low) * (times[min(low + 1, len(times) - 1)] - times[low])
+        page.locator("#time").evaluate(
+            "(slider, seconds) => { slider.value = seconds; slider.dispatchEvent(new Event('input')); }", float(seconds)
+        )
+        found = pictures(page)["left"]
+    assert psnr(found, rendered(file, indices[3], expected_camera("left", headset, headset))) > 40
+    assert page.faults == []
+
+
 def test_the_trigger_plays_and_the_thumbstick_turns_and_zooms(page, headset, player):
     worn(page, player)
     last = pictures(page)["left"]
@@ -167,6 +182,37 @@ def test_the_viewer_shows_the_chosen_frame_in_a_headset(page, service, headset, 
     page.click("#play")
     shown(page)
     assert page.faults == []
+
+
+def test_a_session_that_is_permitted_after_the_scene_was_closed_ends(page, service, headset, finished):
+    page.add_init_script("window.permission = new Promise((allow) => { window.allow = allow; })")
+    opened(page, service, finished)
+    shown(page)
+    page.click("#headset")
+    page.focus("#overlay")
+    page.keyboard.press("ArrowLeft")
+    until(page, "document.getElementById('view').dataset.drawn === 'here'")  # the page still draws
+    page.evaluate("location.hash = '#scene=other'")
+    until(page, "document.querySelector('#curtain h2').innerText === 'There is no such scene'")
+    page.evaluate("window.allow()")
+    until(page, "window.session?.ended")
+    page.click("#headset")  # nothing to show
+    assert [fault for fault in page.faults if "404" not in fault] == []
+
+
+def test_states_that_cannot_be_fetched_are_not_asked_for_again_at_once(page, service, headset, finished):
+    asked = []
+
+    def refuse(route):
+        asked.append(route.request.url)
+        route.fulfill(status=503, body="{}", content_type="application/json")
+
+    page.route("**/states.s4d**", refuse)
+    opened(page, service, finished)
+    shown(page)
+    page.click("#headset")
+    until(page, "window.session?.frames > 100")
+    assert 1 <= len(asked) <= 2
 
 
 def test_without_a_headset_there_is_no_button(page, service, finished, player):

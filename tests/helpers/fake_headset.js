@@ -31,6 +31,7 @@ class FakeSession extends EventTarget {
   }
 
   async end() {
+    if (this.ended) throw new Error("the session has ended already");
     this.ended = true;
     this.dispatchEvent(new Event("end"));
   }
@@ -63,6 +64,7 @@ window.XRWebGLLayer = class {
 Object.defineProperty(navigator, "xr", { value: {
   isSessionSupported: async (mode) => mode === "immersive-vr",
   async requestSession() {
+    await window.permission;
     if (window.headsetRefuses) throw new Error(window.headsetRefuses);
     return (window.session = new FakeSession(window.headsetPoses));
   },

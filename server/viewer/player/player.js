@@ -23,7 +23,7 @@ let [splats, clock, orbit, rig] = [null, null, null, null];
 let scene = null; // what the worker reported about the files
 let shown = null; // { camera, place } of the current picture
 let followed = null; // { row, positions, at }
-let headset = null; // that shows the scene in place of the page
+let headset = null; // the session in a headset, while there is one
 let [dirty, movedAt, tick, pictures] = [true, -Infinity, 0, 0];
 
 // Opening.
@@ -94,7 +94,7 @@ function frame(now) {
 }
 
 function advance(now) {
-  if (!clock || headset) return;
+  if (!clock || headset?.session) return;
   const began = performance.now();
   pass(now);
   if ((dirty || clock.playing) && !splats.busy) {
@@ -192,7 +192,7 @@ function say(words) {
 // Following a Gaussian.
 
 function click(event) {
-  if (!shown) return;
+  if (!shown || headset?.session) return;
   const box = $("overlay").getBoundingClientRect();
   splats.pick((event.clientX - box.left) / box.width * shown.camera.width, (event.clientY - box.top) / box.height * shown.camera.height);
 }
@@ -249,18 +249,17 @@ function showPlaying() {
 /** Shows the scene in a headset, until the button is pressed again or the person leaves. */
 async function wear() {
   if (headset) return headset.end();
-  headset = new Headset(splats, orbit, {
-    moment: (now) => (pass(now), { place: clock.place }),
-    pressed: play,
-    ended() {
-      headset = null;
-      draw();
-    },
-  });
-  try {
-    await headset.begin();
-  } catch (error) {
+  const ended = () => {
+    if (headset !== mine) return;
     headset = null;
+    draw();
+  };
+  const mine = new Headset(splats, orbit, { moment: (now) => (pass(now), { place: clock.place }), pressed: play, ended });
+  headset = mine;
+  try {
+    await mine.begin();
+  } catch (error) {
+    ended();
     say(`The headset cannot be used: ${error.message}`);
   }
 }

@@ -34,7 +34,7 @@ export class Painter {
     this.room = this.count = this.width = this.height = 0;
     this.table = null; // colours that the `paints` texture has
     this.screen = { frame: null, x: 0, y: 0 }; // framebuffer and lower left corner of the finished picture
-    this.target = null; // half floats if possible, to blend in
+    this.target = null; // half floats if possible, to blend in; depth needs them
     this.copy = null; // of pixels that were painted without WebGL
     this.ellipses = this.trails = null;
     this.ramp = this.texture(gl.RGBA8, 256, 1);

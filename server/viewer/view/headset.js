@@ -7,6 +7,7 @@ import { inside } from "../splats/rig.js";
 const REACH = 1.5; // metres of the room that the orbit's distance fills
 const NEAR = 0.05; // near plane in metres of the room
 const [TURN, ZOOM] = [1.5, 1.2]; // radians and e-folds per second with the thumbstick fully deflected
+const LONGEST_S = 0.1; // longest time between two pictures during which a thumbstick counts
 const DEAD = 0.15; // deflection below which a thumbstick is at rest
 const KEPT = 3; // states that the page keeps: those before and after the moment, and the previous one
 const LOST_MS = 1000; // after which an unanswered request is repeated
@@ -27,7 +28,8 @@ export class Headset {
    * @param on { moment(now), pressed(), ended() }: returns the moment to show, as in `Splats.draw`, or null; a trigger was pressed; the session has ended
    */
   constructor(splats, orbit, on) {
-    Object.assign(this, { splats, orbit, on, states: new Map(), paints: new Map(), sorted: null, start: null, tick: null, askedAt: -Infinity });
+    Object.assign(this, { splats, orbit, on, states: new Map(), paints: new Map() });
+    Object.assign(this, { session: null, over: false, sorted: null, start: null, tick: null, askedAt: -Infinity });
   }
 
   /**
@@ -36,37 +38,51 @@ export class Headset {
    * @throws Error if the browser refuses, or has no WebGL2
    */
   async begin() {
-    this.session = await navigator.xr.requestSession("immersive-vr");
-    this.session.addEventListener("end", () => {
+    const session = await navigator.xr.requestSession("immersive-vr");
+    if (this.over) return session.end(); // ended while the browser asked for permission
+    this.session = session;
+    this.splats.on.sorted = (message) => this.receive(message);
+    session.addEventListener("select", () => this.on.pressed());
+    session.addEventListener("end", () => {
+      this.over = true;
       delete this.splats.on.sorted;
       this.painter?.gl.getExtension("WEBGL_lose_context")?.loseContext();
       this.on.ended();
     });
     try {
       this.painter = new Painter(document.createElement("canvas"), true);
-      this.layer = new XRWebGLLayer(this.session, this.painter.gl, { antialias: false, depth: false });
-      await this.session.updateRenderState({ baseLayer: this.layer });
-      this.space = await this.session.requestReferenceSpace("local");
+      this.painter.gl.canvas.addEventListener("webglcontextrestored", () => this.cover());
+      this.cover();
+      this.space = await session.requestReferenceSpace("local");
     } catch (error) {
-      await this.session.end();
+      if (this.over) return; // the person left at once
+      await session.end();
       throw error;
     }
-    this.splats.on.sorted = (message) => this.receive(message);
-    this.session.addEventListener("select", () => this.on.pressed());
-    this.session.requestAnimationFrame((...given) => this.frame(...given));
+    if (!this.over) session.requestAnimationFrame((...given) => this.frame(...given));
+  }
+
+  /** Lets the headset show what the painter's context draws. */
+  cover() {
+    if (this.over) return;
+    this.layer = new XRWebGLLayer(this.session, this.painter.gl, { antialias: false, depth: false });
+    this.session.updateRenderState({ baseLayer: this.layer });
   }
 
   end() {
-    this.session?.end();
+    if (this.over) return;
+    this.over = true;
+    if (this.session) this.session.end();
+    else this.on.ended();
   }
 
   /** Draws a picture for each eye. */
   frame(now, xr) {
     this.session.requestAnimationFrame((...given) => this.frame(...given));
-    this.steer(this.tick === null ? 0 : (now - this.tick) / 1000);
+    this.steer(this.tick === null ? 0 : Math.min((now - this.tick) / 1000, LONGEST_S));
     this.tick = now;
     const pose = xr.getViewerPose(this.space);
-    if (!pose) return; // the headset has lost track of itself
+    if (!pose) return; // the headset does not know its pose at the moment
     this.start ??= startOf(pose.transform.matrix);
     const room = roomOf(this.orbit, this.start);
     const request = this.on.moment(now);
@@ -83,9 +99,13 @@ export class Headset {
   receive(message) {
     this.askedAt = -Infinity;
     if (!message.order) return; // the frame is no longer loaded
-    const [from, to] = [message.from, message.to].map((state) => state && kept(this.states, KEPT, state));
-    const paint = typeof message.paint === "string" ? message.paint : kept(this.paints, 1, message.paint).values;
-    this.sorted = { ...message, from, to, paint };
+    const [from, to] = [message.from, message.to].map((state) => state && (this.states.get(state.number) ?? state));
+    const paint = this.paints.get(message.paint.number) ?? message.paint;
+    const dropped = [from, to].some((state) => state && !state.texels) || (paint.number && !paint.values);
+    if (dropped) return; // since the request; the next one asks for it again
+    for (const state of [from, to]) if (state) keep(this.states, KEPT, state);
+    if (paint.number) keep(this.paints, 1, paint);
+    this.sorted = { ...message, from, to, paint: paint.values ?? paint };
   }
 
   paint({ x, y, width, height }, view, room) {
@@ -108,13 +128,11 @@ export class Headset {
   }
 }
 
-/** Remembers a value by its number, together with the most recent others, and returns the remembered one. */
-function kept(values, most, value) {
-  const known = values.get(value.number) ?? value;
+/** Keeps a value under its number as the most recent one, and drops the oldest beyond `most`. */
+function keep(values, most, value) {
   values.delete(value.number);
-  values.set(value.number, known);
+  values.set(value.number, value);
   if (values.size > most) values.delete(values.keys().next().value);
-  return known;
 }
 
 /** Head at the beginning: its place, and the axes of the room: right, up, and back from where it looks. Column-major pose. */

@@ -83,7 +83,12 @@ export class Here {
   /** Whether pictures of a mode are drawn here once their frame is loaded. */
   draws(mode) {
     return this.possible && this.how !== "service" && KINDS.includes(mode) && !(this.how === "auto" && this.slow)
-      && performance.now() - this.failedAt > AGAIN_MS;
+      && !this.hasFailed();
+  }
+
+  /** Whether loading or drawing has failed recently. */
+  hasFailed() {
+    return performance.now() - this.failedAt < AGAIN_MS;
   }
 
   has(index) {

@@ -169,19 +169,29 @@ export class LiveView {
    */
   async wear(pressed) {
     if (this.headset) return this.headset.end();
-    this.headset = new Headset(this.here.begin(), this.orbit, { moment: () => this.momentHere(), pressed, ended: () => this.unworn() });
-    this.here.setLook(this.mode, this.background);
+    if (!this.stream) return;
+    const ended = () => {
+      if (this.headset !== headset) return;
+      this.headset = null;
+      this.moved();
+    };
+    const headset = new Headset(this.here.begin(), this.orbit, { moment: () => this.momentHere(), pressed, ended });
+    this.headset = headset;
     try {
-      await this.headset.begin();
+      await headset.begin();
     } catch (error) {
-      this.unworn();
+      ended();
       throw error;
     }
+    this.moved();
   }
 
-  unworn() {
-    this.headset = null;
-    this.moved();
+  /** Passes mode, background and parts on to the headset, so that the service need not render. */
+  drawInHeadset() {
+    clearTimeout(this.settle);
+    this.stream.unsubscribe("view");
+    this.here.setLook(this.mode, this.background);
+    if (this.mode === "parts") this.here.askParts(this.frame ?? readable().at(-1)?.index);
   }
 
   /** Moment to draw here, { index, next, share }; null if its frame is not loaded. */
@@ -189,7 +199,7 @@ export class LiveView {
     const live = this.follow();
     const index = live ? this.here.live.frame : this.frame ?? readable().at(-1)?.index;
     if (index === undefined) return null;
-    if (!live) this.here.fetch(index);
+    if (!live && !this.here.hasFailed()) this.here.fetch(index);
     if (!this.here.has(index)) return null;
     return live ? this.here.liveMoment() : { index, ...this.between };
   }
@@ -224,7 +234,7 @@ export class LiveView {
   /** Draws or requests a picture after a change of camera, size or mode: a quick one now, a sharp one at rest. */
   moved(sharp = false) {
     if (!this.stream) return;
-    if (this.headset) return this.here.setLook(this.mode, this.background);
+    if (this.headset?.session) return this.drawInHeadset();
     if (document.hidden) return void this.follow();
     clearTimeout(this.settle);
     this.movedAt = performance.now();
@@ -245,7 +255,7 @@ export class LiveView {
   drawHere(moving = false) {
     const { here } = this;
     const live = this.follow();
-    if (!here.draws(this.mode) || !(live || this.isTouched()) || !(live || readable().length)) return false;
+    if (!here.draws(this.mode) || !(live || (this.isTouched() && readable().length))) return false;
     const moment = this.momentHere();
     if (!moment) return here.alone && !here.said;
     if (here.alone || live) this.stream.unsubscribe("view"); // otherwise, the service would render every new frame

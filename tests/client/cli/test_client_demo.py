@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import io
 import re
+import signal
 import subprocess
 import sys
 
 import fakes
+import httpx
 import numpy as np
 import pytest
 from PIL import Image
@@ -61,6 +63,25 @@ def test_it_waits_for_the_kernels_and_leaves_pictures(done):
     assert pictures == [*(f"camera_2/{t:06d}.png" for t in range(4)), "depth.png", "parts.png"]
     with Image.open(out / "camera_2/000001.png") as picture:
         assert picture.size == (3 * WIDTH, HEIGHT)
+
+
+def test_its_service_ends_with_it(tmp_path):
+    script = f"""
+import time
+from pathlib import Path
+from client.cli.demo import running_service
+with running_service(Path({str(tmp_path / "data")!r}), Path({str(tmp_path / "log")!r})) as url:
+    print("url", url, flush=True)
+    time.sleep({HANG_S})
+"""
+    command = [sys.executable, "-c", script]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=fakes.environment(TERM="dumb")) as process:
+        url = next(line.split()[1] for line in process.stdout if line.startswith("url"))
+        assert httpx.get(f"{url}/health/live").status_code == 200
+        process.terminate()
+        assert process.wait(HANG_S) == 128 + signal.SIGTERM
+    with pytest.raises(httpx.ConnectError):
+        httpx.get(f"{url}/health/live")
 
 
 def test_its_scene_can_be_looked_at_later_and_its_parts_have_the_colours_of_the_service(
