@@ -46,16 +46,12 @@ def targets(
     out: Study = QUALITY,
     run: Annotated[
         list[str] | None,
-        typer.Option(help="Measure only this run, such as scas4d, clusters-64 or dynamic3dgs-2000. May be repeated."),
+        typer.Option(help="Measure only this run, such as scas4d or dynamic3dgs. May be repeated."),
     ] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Number of frames, shown in the table.")] = None,
     again: Again = False,
 ) -> None:
-    """Measures the rows that the targets need. `scripts/bench table` compares them with the targets.
-
-    The most expensive runs come last. The run dynamic3dgs-2000 takes 20 times as long as the others; use --frames to
-    shorten it.
-    """
+    """Measures the rows that the targets need. `scripts/bench table` compares them with the targets."""
     from studies.quality.runs import measure_runs
 
     rows = measure_runs(captures, out, run or (), frames=frames, again=again)

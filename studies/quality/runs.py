@@ -8,22 +8,12 @@ from pathlib import Path
 
 from client.cli.evaluate import Job, Report
 from client.cli.scores import Row, Store
-from scas4d_core.presets import preset
 from scas4d_core.settings import Settings
 from studies.quality.quality import OBJECT_CAPTURES, run_jobs
 from studies.quality.settings import settings_of
 
 CAPTURES = (*OBJECT_CAPTURES, "stage", "basketball")
 """Folder names of the captures for which there are targets."""
-
-CAPTURE_CHANGES: Mapping[str, tuple[str, ...]] = {}
-"""Maps a capture to settings that it needs in every run, such as a Gaussian budget or a floor.
-
-These settings must not be used to tune a method.
-"""
-
-OTHER_MAP = "published" if preset("scas4d").update.cluster_map == "centred" else "centred"
-"""Name of the cluster map that is not the default."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +23,6 @@ class Run:
     Attributes:
         captures: names of the capture folders.
         preset: preset name.
-        iterations: iterations per update.
-        changes: further settings, such as ``"update.clusters=[64]"``.
         masks: whether the masks are passed to the method.
         points: whether the initial points are passed to the method.
         frames: number of frames; all if None.
@@ -42,15 +30,13 @@ class Run:
 
     captures: tuple[str, ...]
     preset: str = "scas4d"
-    iterations: int = 100
-    changes: tuple[str, ...] = ()
     masks: bool = True
     points: bool = True
     frames: int | None = None
 
-    def settings(self, capture: str) -> Settings:
-        """Returns the complete settings of the run for a capture."""
-        return settings_of(self.preset, self.iterations, changes=[*CAPTURE_CHANGES.get(capture, ()), *self.changes])
+    def settings(self) -> Settings:
+        """Returns the complete settings of the run, with 100 iterations per update."""
+        return settings_of(self.preset, 100)
 
     def job(self, folder: Path, frames: int | None = None) -> Job:
         """Returns the job that measures one capture, optionally limited to ``frames`` frames."""
@@ -58,7 +44,7 @@ class Run:
         return Job(
             capture=folder,
             preset=self.preset,
-            settings=self.settings(folder.resolve().name),
+            settings=self.settings(),
             frames=min(limits) if limits else None,
             masks=self.masks,
             points=self.points,
@@ -70,13 +56,8 @@ RUNS: Mapping[str, Run] = {
     "robot-unaided": Run(("robot",), masks=False, points=False, frames=1),
     "basketball-cloudless": Run(("basketball",), points=False, frames=1),
     "dynamic3dgs": Run(CAPTURES, "dynamic3dgs"),
-    "clusters-64": Run(OBJECT_CAPTURES, changes=("update.clusters=[64]",)),
-    "clusters-320": Run(OBJECT_CAPTURES, changes=("update.clusters=[320]",)),
-    "clusters-1280": Run(OBJECT_CAPTURES, changes=("update.clusters=[1280]",)),
-    "other-map": Run(CAPTURES, changes=(f"update.cluster_map={OTHER_MAP}",)),
-    "dynamic3dgs-2000": Run(OBJECT_CAPTURES, "dynamic3dgs", 2000),
 }
-"""Runs by name, in the order in which they are measured, with the most expensive last."""
+"""Runs by name, in the order in which they are measured."""
 
 
 def measure_runs(
@@ -130,7 +111,7 @@ def measured_runs(store: Store) -> dict[tuple[str, str], Row]:
     by_run: dict[tuple[str, str], Row] = {}
     for name, run in RUNS.items():
         for capture in run.captures:
-            settings = run.settings(capture).model_dump(mode="json")
+            settings = run.settings().model_dump(mode="json")
             groups = ("scene", "static") if run.frames == 1 else tuple(settings)
             for row in rows:
                 given = row["given"]

@@ -11,16 +11,13 @@ from typing import Literal
 import numpy as np
 
 from client.cli.scores import Row, Store, markdown
-from scas4d_core.presets import preset
 from studies.machine import provenance
 from studies.marks import marked, marked_days, marked_table
 from studies.quality.quality import OBJECT_CAPTURES
-from studies.quality.runs import CAPTURES, OTHER_MAP, RUNS, measured_runs
+from studies.quality.runs import RUNS, measured_runs
 
 KERNELS = "kernels"
 """Value of ``Target.run`` for figures from the kernel study (``studies.kernels``), which has no run."""
-MAPS = f"{preset('scas4d').update.cluster_map} − {OTHER_MAP} cluster map"
-K1 = ("clusters-64", "clusters-320", "clusters-1280")
 
 Rows = Mapping[tuple[str, str], Row]
 """Maps a run and a capture to their measured row."""
@@ -39,7 +36,7 @@ class Target:
         sense: operator with which the figure is compared with the threshold.
         threshold: threshold in ``unit``; if None, the figure is only reported.
         unit: unit of the figure.
-        over: if given, the figure is the difference from the best of these runs (higher is better).
+        over: run from which the figure is the difference, if any.
         mean: whether the mean over the captures is compared.
     """
 
@@ -50,7 +47,7 @@ class Target:
     sense: Literal["≥", ">", "≤", "<", ""] = ""
     threshold: float | None = None
     unit: str = "dB"
-    over: tuple[str, ...] = ()
+    over: str | None = None
     mean: bool = False
 
 
@@ -62,32 +59,18 @@ TARGETS: tuple[Target, ...] = (
     Target("frame 0 without points and masks", "robot-unaided", "psnr_first", ("robot",), "≥", 35.0),
     Target(
         "frame 0 without points and masks − with both",
-        "robot-unaided", "psnr_first", ("robot",), "≥", -1.0, over=("scas4d",),
+        "robot-unaided", "psnr_first", ("robot",), "≥", -1.0, over="scas4d",
     ),
     Target("number of Gaussians", "scas4d", "gaussians", ("robot",), "≤", 25_000, ""),
     Target("update PSNR", "scas4d", "psnr", ("robot",), "≥", 31.0),
     Target("update PSNR", "scas4d", "psnr", OBJECT_CAPTURES, "≥", 30.5, mean=True),
     Target("update PSNR (room with shadows)", "scas4d", "psnr", ("stage",), "≥", 27.0),
-    Target("scas4d − dynamic3dgs, 100 iterations", "scas4d", "psnr", ("robot",), "≥", 8.0, over=("dynamic3dgs",)),
+    Target("scas4d − dynamic3dgs, 100 iterations", "scas4d", "psnr", ("robot",), "≥", 8.0, over="dynamic3dgs"),
     Target(
         "scas4d − dynamic3dgs, 100 iterations",
         "scas4d", "psnr", ("wheel", "pendulums", "cloth", "spring", "stage", "basketball"), ">", 0.0,
-        over=("dynamic3dgs",),
+        over="dynamic3dgs",
     ),
-    Target(
-        "scas4d, 100 iterations − dynamic3dgs, 2000 iterations",
-        "scas4d", "psnr", ("robot",), ">", 0.0, over=("dynamic3dgs-2000",),
-    ),
-    Target(
-        "scas4d, 100 iterations − dynamic3dgs, 2000 iterations",
-        "scas4d", "psnr", OBJECT_CAPTURES, "≥", -0.5, over=("dynamic3dgs-2000",), mean=True,
-    ),
-    Target("dynamic3dgs, 2000 iterations", "dynamic3dgs-2000", "psnr", ("robot",), "≥", 28.5),
-    Target(
-        "three layers − best single layer (64, 320, 1280)", "scas4d", "psnr", OBJECT_CAPTURES, ">", 0.0, over=K1,
-    ),
-    Target(MAPS, "scas4d", "psnr", OBJECT_CAPTURES, ">", 0.0, over=("other-map",), mean=True),
-    Target(MAPS, "scas4d", "psnr", CAPTURES, over=("other-map",)),
     Target("frame 0 from its point cloud (paper: 30.25)", "scas4d", "psnr_first", ("basketball",), "≥", 29.0),
     Target("mean PSNR loss relative to frame 0", "scas4d", "loss", ("basketball",), "≤", 0.5),
     Target("worst PSNR loss relative to frame 0", "scas4d", "loss_worst", ("basketball",), "≤", 1.0),
@@ -105,11 +88,7 @@ TARGETS: tuple[Target, ...] = (
     Target("parts, adjusted Rand index", "scas4d", "parts_ari", ("robot", "pendulums"), "≥", 0.7, ""),
     Target(
         "parts, scas4d − dynamic3dgs, 100 iterations",
-        "scas4d", "parts_ari", ("robot", "pendulums"), ">", 0.0, "", ("dynamic3dgs",),
-    ),
-    Target(
-        "parts, scas4d − dynamic3dgs, 2000 iterations",
-        "scas4d", "parts_ari", ("robot", "pendulums"), ">", 0.0, "", ("dynamic3dgs-2000",),
+        "scas4d", "parts_ari", ("robot", "pendulums"), ">", 0.0, "", "dynamic3dgs",
     ),
     Target("rasterizer-to-arithmetic ratio, frame 0", KERNELS, "ratio_rasterizer", ("robot",), "≤", 2.0, "×"),
     Target("rasterizer-to-arithmetic ratio, cloud", KERNELS, "ratio_rasterizer_cloud", ("robot",), "≤", 2.0, "×"),
@@ -170,7 +149,7 @@ def compare(rows: Rows, targets: Sequence[Target] = TARGETS) -> list[Verdict]:
 
 def figure_of(target: Target, capture: str, rows: Rows) -> Figure | None:
     """Returns the figure of a capture, or None if a required row or value is missing."""
-    needed = [rows.get((run, capture)) for run in (target.run, *target.over)]
+    needed = [rows.get((run, capture)) for run in (target.run, target.over) if run is not None]
     there = [row for row in needed if row is not None]
     if len(there) < len(needed):
         return None
@@ -179,11 +158,10 @@ def figure_of(target: Target, capture: str, rows: Rows) -> Figure | None:
     known = [value for value in values if value is not None]
     if len(known) < len(values):
         return None
-    own, others = known[0], known[1:]
     words = _updates(target.metric, there, updates)
-    if not others:
-        return Figure(own, None, words)
-    return Figure(own - max(others), (own, max(others)), words)
+    if target.over is None:
+        return Figure(known[0], None, words)
+    return Figure(known[0] - known[1], (known[0], known[1]), words)
 
 
 def target_table(verdicts: Sequence[Verdict]) -> str:
@@ -246,7 +224,7 @@ def page(rows: Rows) -> str:
     """
     verdicts = compare(rows)
     days, machines, cores = provenance(rows.values())
-    runs = [(name, run) for name, run in RUNS.items() if run.preset == "scas4d" and not run.changes]
+    runs = [(name, run) for name, run in RUNS.items() if run.preset == "scas4d"]
     behind = [rows[name, capture] for name, run in runs for capture in run.captures if (name, capture) in rows]
     return f"""# Quality
 
