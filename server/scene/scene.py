@@ -248,7 +248,7 @@ class Scene:
                 field=field,
                 value=start,
                 remedy=f"use a range within {self.committed[0]} to {self.committed[-1]}"
-                if start <= end
+                if first is None or last is None or first <= last
                 else "exchange the first and the last frame",
             )
         return frames

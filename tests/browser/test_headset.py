@@ -12,6 +12,7 @@ from browser_page import FRAMES, expect, opened, shown, until
 from export_cases import bent
 from scipy.spatial.transform import Rotation
 from splat_pictures import psnr, rendered
+from waiting import HANG_S
 
 from client.exports.player import export_player
 from scas4d_core.compact import CompactReader
@@ -85,6 +86,22 @@ def pictures(page):
     return {"left": rgba[:, 0, :, :3] / 255, "right": rgba[:, 1, :, :3] / 255}
 
 
+def pictures_when(page, condition):
+    """Waits until the pictures meet a condition, because the worker sorts meanwhile; the pictures."""
+    for _ in range(int(HANG_S)):
+        found = pictures(page)
+        if condition(found):
+            return found
+        page.wait_for_timeout(200)
+    raise AssertionError("the pictures did not come to be as expected")
+
+
+def at_rest(page):
+    """Waits until the pictures no longer change; the picture of the left eye."""
+    last = pictures(page)["left"]
+    return pictures_when(page, lambda found: np.array_equal(found["left"], last))["left"]
+
+
 @pytest.fixture
 def headset(page):
     """A page in a browser with a headset; returns the pose of the head when the session begins."""
@@ -119,11 +136,9 @@ def test_each_eye_sees_what_the_cpu_rasterizer_renders(page, headset, player, fi
     moved = pose([0.4, 1.5, -0.5], 35, -20)
     for head in (headset, moved):
         page.evaluate("(poses) => (window.session.poses = poses)", sent(head))
-        found = pictures(page)
-        for name in ("left", "right"):
-            true = rendered(file, first, expected_camera(name, head, headset))
-            assert true.std() > 0.05  # it shows something
-            assert psnr(found[name], true) > 44
+        true = {name: rendered(file, first, expected_camera(name, head, headset)) for name in ("left", "right")}
+        assert min(picture.std() for picture in true.values()) > 0.05  # they show something
+        found = pictures_when(page, lambda found, true=true: min(psnr(found[eye], true[eye]) for eye in true) > 44)
     assert psnr(found["left"], found["right"]) < 30
     assert page.faults == []
 
@@ -138,27 +153,26 @@ def test_frames_that_the_page_has_dropped_are_sent_again(page, headset, player, 
         page.locator("#time").evaluate(
             "(slider, seconds) => { slider.value = seconds; slider.dispatchEvent(new Event('input')); }", float(seconds)
         )
-        found = pictures(page)["left"]
-    assert psnr(found, rendered(file, indices[3], expected_camera("left", headset, headset))) > 40
+        pictures(page)
+    true = rendered(file, indices[3], expected_camera("left", headset, headset))
+    pictures_when(page, lambda found: psnr(found["left"], true) > 40)
     assert page.faults == []
 
 
 def test_the_trigger_plays_and_the_thumbstick_turns_and_zooms(page, headset, player):
     worn(page, player)
-    last = pictures(page)["left"]
+    last = at_rest(page)
     for axes in ([0, 0, 1, 0], [0, 0, 0, -1]):
         page.evaluate("(axes) => (window.session.inputSources = [{ gamepad: { axes } }, {}])", axes)
         page.wait_for_timeout(300)
         page.evaluate("() => (window.session.inputSources = [{ gamepad: { axes: [0, 0, 0.1, 0] } }])")
-        now = pictures(page)["left"]
+        now = at_rest(page)
         assert psnr(now, last) < 30
         last = now
-        assert np.array_equal(pictures(page)["left"], last)  # at rest
     page.evaluate("() => window.session.dispatchEvent(new Event('select'))")
     expect(page.locator("#play")).to_have_attribute("aria-label", "Pause")
     before = page.locator("#moment").inner_text()
-    until(page, "window.session.frames > 40")
-    assert psnr(pictures(page)["left"], last) < 60  # other frames
+    pictures_when(page, lambda found: psnr(found["left"], last) < 60)  # other frames
     page.click("#headset")
     until(page, "window.session.ended")
     until(page, f"document.getElementById('moment').innerText !== {before!r}")  # the page draws again
@@ -171,10 +185,9 @@ def test_the_viewer_shows_the_chosen_frame_in_a_headset(page, service, headset, 
     page.click("#headset")
     until(page, "window.session?.frames > 3")
     until(page, "Math.max(...window.session.picture().filter((_, k) => k % 4 < 3)) > 40")
-    newest = pictures(page)["left"]
+    newest = at_rest(page)
     page.locator("#time").fill("0")
-    page.wait_for_timeout(500)
-    assert psnr(pictures(page)["left"], newest) < 40
+    pictures_when(page, lambda found: psnr(found["left"], newest) < 40)
     page.evaluate("() => window.session.dispatchEvent(new Event('select'))")
     expect(page.locator("#play")).to_have_attribute("aria-label", "Pause")
     page.click("#headset")

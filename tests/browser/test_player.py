@@ -56,6 +56,25 @@ def differ(one, other):
     return np.abs(one - other).mean() > 0.3
 
 
+def changed(page, before):
+    """Waits until another picture is shown; the picture."""
+    return seen_when(page, lambda picture: differ(before, picture))
+
+
+def restored(page, before):
+    """Waits until an earlier picture is shown again; the picture."""
+    return seen_when(page, lambda picture: not differ(before, picture))
+
+
+def seen_when(page, condition):
+    for _ in range(int(HANG_S)):
+        picture = seen(page)
+        if condition(picture):
+            return picture
+        page.wait_for_timeout(700)
+    raise AssertionError("the picture did not come to be as expected")
+
+
 def test_it_plays_without_a_network(offline, player):
     first = opened(offline, player)
     assert first.std() > 10
@@ -70,10 +89,10 @@ def test_it_plays_without_a_network(offline, player):
     assert any(place % 1 for place in places)  # in between: slow motion
     until(offline, "Number(document.body.dataset.place) > 1.5")
     offline.click("#play")
-    assert differ(first, seen(offline))
+    changed(offline, first)
     offline.locator("#time").fill("0.4")  # the time of the first frame
     until(offline, "document.body.dataset.place === '0.000'")
-    assert not differ(first, seen(offline))
+    restored(offline, first)
     offline.focus("#overlay")
     offline.keyboard.press(".")
     until(offline, "document.getElementById('moment').innerText.startsWith('frame 12')")
@@ -86,27 +105,25 @@ def test_it_turns_and_shows_depth_and_parts(offline, player):
     offline.mouse.down()
     offline.mouse.move(650, 320, steps=4)
     offline.mouse.up()
-    assert differ(first, seen(offline, 600))
+    changed(offline, first)
     offline.focus("#overlay")
     offline.keyboard.press("Home")
-    assert not differ(first, seen(offline, 600))
+    restored(offline, first)
     offline.keyboard.press("2")
-    depth = seen(offline)
-    assert differ(first, depth)
+    depth = changed(offline, first)
     near, far = (float(offline.locator(f"#{id}").inner_text()) for id in ("near", "far"))
     assert 1 < near < far < 6
     offline.click("#modes [data-mode=parts]")
-    assert differ(depth, seen(offline))
+    changed(offline, depth)
     expect(offline.locator("#legend")).to_be_hidden()
     offline.click("#parts-box summary")
     expect(offline.locator("#parts li")).to_have_count(bent.PARTS + 1)
-    whole = seen(offline)
+    whole = seen(offline, 700)
     offline.get_by_label("Show part 2 alone").click()
-    alone = seen(offline)
+    changed(offline, whole)
     expect(offline.locator("#parts-words")).to_contain_text("3 of 4 hidden", use_inner_text=True)
-    assert differ(whole, alone)
     offline.get_by_label("Show part 2 alone").click()
-    assert not differ(whole, seen(offline))
+    restored(offline, whole)
     assert offline.faults == []
 
 
@@ -120,8 +137,7 @@ def test_a_gaussian_is_followed_and_trails_are_drawn(offline, player):
     before = seen(offline)
     offline.select_option("#trails", "200")
     offline.locator("#time").fill("0.88")
-    after = seen(offline, 600)
-    assert differ(before, after)
+    changed(offline, before)
     assert (canvas(offline, "overlay")[..., 3] > 0).sum() > 50  # its track
     offline.mouse.click(box["x"] + 4, box["y"] + 4)
     until(offline, "document.getElementById('note').innerText.includes('nothing at that point')")
@@ -183,5 +199,5 @@ def test_a_damaged_frame_costs_its_own_pictures_alone(offline, player, tmp_path)
     expect(offline.locator("#curtain")).to_be_hidden()
     offline.locator("#time").fill("0.88")
     until(offline, "document.body.dataset.place === '6.000'")
-    assert differ(first, seen(offline))
+    changed(offline, first)
     assert offline.faults == []
