@@ -111,7 +111,7 @@ def test_captures_without_rows_come_from_the_study_of_quality(tmp_path):
     store = Store(tmp_path / "quality")
     for name, psnr in (("scas4d", [29.0, 28.0, 26.0]), ("dynamic3dgs", [29.0, 25.0])):
         row = made_row(DEFAULT, "basketball", len(psnr) - 1, key=name, psnr_by_frame=psnr)
-        row["settings"] = RUNS[name].settings("basketball").model_dump(mode="json")
+        row["settings"] = RUNS[name].settings().model_dump(mode="json")
         store.put(row)
     found = measured(tmp_path / "frontier", ["robot", "basketball"], 5, tmp_path / "quality")
     assert found[DEFAULT, "psnr"] == {"robot": pytest.approx(made_psnr(DEFAULT)), "basketball": 28.0}  # one update both
