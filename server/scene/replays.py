@@ -163,10 +163,11 @@ class Replays:
         try:
             fault = await wait_for_job(self._placement, replayer.main, spec, self._on_message, "replay")
         except Exception as error:
-            log.debug("scene %s: a replay failed", self._ledger.scene, exc_info=error)
+            log.exception("scene %s: a replay failed", self._ledger.scene)
             fault = f"internal error: {type(error).__name__}: {message_of(error)}"
-        if fault is not None:
-            log.error("scene %s: a replay failed: %s", self._ledger.scene, fault)
+        else:
+            if fault is not None:
+                log.error("scene %s: a replay failed: %s", self._ledger.scene, fault)
         self.status.state = ReplayState.DONE if fault is None else ReplayState.FAILED
         self.status.error = fault
 

@@ -8,11 +8,10 @@ import browser_engine
 import fakes
 import numpy as np
 import pytest
-from browser_page import FRAMES, expect, opened, shown, until
+from browser_page import FRAMES, expect, opened, read_until, shown, until
 from export_cases import bent
 from scipy.spatial.transform import Rotation
 from splat_pictures import psnr, rendered
-from waiting import HANG_S
 
 from client.exports.player import export_player
 from scas4d_core.compact import CompactReader
@@ -88,12 +87,7 @@ def pictures(page):
 
 def pictures_when(page, condition):
     """Waits until the pictures meet a condition, because the worker sorts meanwhile; the pictures."""
-    for _ in range(int(HANG_S)):
-        found = pictures(page)
-        if condition(found):
-            return found
-        page.wait_for_timeout(200)
-    raise AssertionError("the pictures did not come to be as expected")
+    return read_until(page, lambda: pictures(page), condition)
 
 
 def at_rest(page):

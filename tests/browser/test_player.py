@@ -8,7 +8,7 @@ import struct
 import browser_engine
 import numpy as np
 import pytest
-from browser_page import canvas, expect, until
+from browser_page import canvas, expect, read_until, until
 from export_cases import bent
 from PIL import Image
 from waiting import HANG_S
@@ -58,21 +58,12 @@ def differ(one, other):
 
 def changed(page, before):
     """Waits until another picture is shown; the picture."""
-    return seen_when(page, lambda picture: differ(before, picture))
+    return read_until(page, lambda: seen(page), lambda picture: differ(before, picture))
 
 
 def restored(page, before):
     """Waits until an earlier picture is shown again; the picture."""
-    return seen_when(page, lambda picture: not differ(before, picture))
-
-
-def seen_when(page, condition):
-    for _ in range(int(HANG_S)):
-        picture = seen(page)
-        if condition(picture):
-            return picture
-        page.wait_for_timeout(700)
-    raise AssertionError("the picture did not come to be as expected")
+    return read_until(page, lambda: seen(page), lambda picture: not differ(before, picture))
 
 
 def test_it_plays_without_a_network(offline, player):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import httpx
 import pytest
+from browser_page import read_until
 from waiting import HANG_S
 
 from server.routes.reference import FILES
@@ -40,11 +41,13 @@ def test_the_pages_are_shown_and_can_be_searched(page, service):
     page.goto(f"{service.url}/docs")
     page.get_by_role("heading", name="Try it").wait_for()
     field = page.get_by_role("combobox", name="Search")
-    for _ in range(int(HANG_S)):  # the key has an effect only after the page's script has started
+
+    def press():  # the key has an effect only after the page's script has started
         page.keyboard.press("/")
         page.wait_for_timeout(1000)
-        if field.is_visible():
-            break
+        return field.is_visible()
+
+    read_until(page, press, bool)
     field.fill("checkpoint")
     page.get_by_text("Order of writes").first.click()
     page.wait_for_url("**/docs/durability.html*")

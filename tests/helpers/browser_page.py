@@ -55,6 +55,16 @@ def until(page, condition):
         raise AssertionError(f"not within the time: {condition}; the page shows {_text(page)!r}") from error
 
 
+def read_until(page, read, condition, pause=200):
+    """Reads a value of the page, with pauses in milliseconds, until it meets a condition; the value."""
+    for _ in range(int(HANG_S)):
+        found = read()
+        if condition(found):
+            return found
+        page.wait_for_timeout(pause)
+    raise AssertionError(f"the page did not come to be as expected; it shows {_text(page)!r}")
+
+
 def expect(locator):
     """Playwright's assertions on a locator, which wait: the page shows parts of one event at different times."""
     from playwright.sync_api import expect as waiting_expect  # without it the tests of the page are skipped

@@ -250,16 +250,13 @@ function showPlaying() {
 async function wear() {
   if (headset) return headset.end();
   const ended = () => {
-    if (headset !== mine) return;
     headset = null;
     draw();
   };
-  const mine = new Headset(splats, orbit, { moment: (now) => (pass(now), { place: clock.place }), pressed: play, ended });
-  headset = mine;
+  headset = new Headset(splats, orbit, { moment: (now) => (pass(now), { place: clock.place }), pressed: play, ended });
   try {
-    await mine.begin();
+    await headset.begin();
   } catch (error) {
-    ended();
     say(`The headset cannot be used: ${error.message}`);
   }
 }

@@ -25,7 +25,7 @@ export class Headset {
   /**
    * @param splats drawing in the worker, which has the frames
    * @param orbit orbit of the page, from which the scene is seen; the thumbstick moves it
-   * @param on { moment(now), pressed(), ended() }: returns the moment to show, as in `Splats.draw`, or null; a trigger was pressed; the session has ended
+   * @param on { moment(now), pressed(), ended() }: returns the moment to show, as in `Splats.draw`, or null; a trigger was pressed; the session has ended, or could not begin; called once
    */
   constructor(splats, orbit, on) {
     Object.assign(this, { splats, orbit, on, states: new Map(), paints: new Map() });
@@ -35,31 +35,30 @@ export class Headset {
   /**
    * Begins a session; called while a click is handled.
    *
-   * @throws Error if the browser refuses, or has no WebGL2
+   * @throws Error if the browser refuses, or has no WebGL2; `ended` has been called then, too
    */
   async begin() {
-    const session = await navigator.xr.requestSession("immersive-vr");
-    if (this.over) return session.end(); // ended while the browser asked for permission
-    this.session = session;
-    this.splats.on.sorted = (message) => this.receive(message);
-    session.addEventListener("select", () => this.on.pressed());
-    session.addEventListener("end", () => {
-      this.over = true;
-      delete this.splats.on.sorted;
-      this.painter?.gl.getExtension("WEBGL_lose_context")?.loseContext();
-      this.on.ended();
-    });
     try {
+      const session = await navigator.xr.requestSession("immersive-vr");
+      if (this.over) return session.end(); // ended while the browser asked for permission
+      this.session = session;
+      this.splats.on.sorted = (message) => this.receive(message);
+      session.addEventListener("select", () => this.on.pressed());
+      session.addEventListener("end", () => {
+        delete this.splats.on.sorted;
+        this.painter?.gl.getExtension("WEBGL_lose_context")?.loseContext();
+        this.finish();
+      });
       this.painter = new Painter(document.createElement("canvas"), true);
       this.painter.gl.canvas.addEventListener("webglcontextrestored", () => this.cover());
       this.cover();
       this.space = await session.requestReferenceSpace("local");
+      if (!this.over) session.requestAnimationFrame((...given) => this.frame(...given));
     } catch (error) {
-      if (this.over) return; // the person left at once
-      await session.end();
+      if (this.over) return; // nobody waits for it any more
+      this.end();
       throw error;
     }
-    if (!this.over) session.requestAnimationFrame((...given) => this.frame(...given));
   }
 
   /** Lets the headset show what the painter's context draws. */
@@ -71,9 +70,13 @@ export class Headset {
 
   end() {
     if (this.over) return;
+    if (this.session) this.session.end().catch(() => {}); // may be ending already
+    else this.finish();
+  }
+
+  finish() {
     this.over = true;
-    if (this.session) this.session.end();
-    else this.on.ended();
+    this.on.ended();
   }
 
   /** Draws a picture for each eye. */

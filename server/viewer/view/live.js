@@ -171,18 +171,11 @@ export class LiveView {
     if (this.headset) return this.headset.end();
     if (!this.stream) return;
     const ended = () => {
-      if (this.headset !== headset) return;
       this.headset = null;
       this.moved();
     };
-    const headset = new Headset(this.here.begin(), this.orbit, { moment: () => this.momentHere(), pressed, ended });
-    this.headset = headset;
-    try {
-      await headset.begin();
-    } catch (error) {
-      ended();
-      throw error;
-    }
+    this.headset = new Headset(this.here.begin(), this.orbit, { moment: () => this.momentHere(), pressed, ended });
+    await this.headset.begin();
     this.moved();
   }
 
